@@ -21,7 +21,7 @@ help:
 	@echo 'make install  only make .venv and install everything into it'
 	@echo 'make clean    remove .venv and everything that was built'
 
-install: $(STAMPS)/splatseg
+install: $(STAMPS)/splatseg $(STAMPS)/bench
 
 demo: install
 	$(BIN)/splatseg demo
@@ -49,6 +49,11 @@ $(STAMPS)/build: $(STAMPS)/torch
 
 $(STAMPS)/splatseg: $(STAMPS)/build pyproject.toml $(NATIVE_SOURCES)
 	PATH="$(CURDIR)/$(BIN):$$PATH" $(PIP) install --no-build-isolation --editable '.[dev]'
+	@touch $@
+
+# Benchmarks, a distribution of its own; whatever they need is installed by now.
+$(STAMPS)/bench: $(STAMPS)/splatseg bench/pyproject.toml
+	$(PIP) install --no-build-isolation --no-deps --editable bench
 	@touch $@
 
 clean:

@@ -35,7 +35,7 @@ from splatseg.io.depths import read_depth_map
 from splatseg.io.pointmaps import RecordedPointmaps, create_pointmaps
 from splatseg.pose import recover_poses
 from splatseg.pose.pointmaps import PointmapOptions, recover_from_pointmaps
-from splatseg.synthetic import PointmapErrors, SyntheticPointmaps, synthetic_pointmaps
+from splatseg_bench.worlds import PointmapErrors, SyntheticPointmaps, synthetic_pointmaps
 
 GOALS = {"rotation max deg": 0.5, "centre max % of extent": 1.0, "focal off": 0.01}
 KINDS = {

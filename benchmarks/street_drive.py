@@ -2,7 +2,7 @@
 
     nice python benchmarks/street_drive.py [--kilometres 20] [--threads 1] [--json FILE]
 
-Generated streets of 200 m (`splatseg.synthetic.street`, six seeds by turns) are put end to end,
+Generated streets of 200 m (`splatseg_bench.worlds.street`, six seeds by turns) are put end to end,
 each or its mirror image, whichever keeps the road going on; a road that comes back is refused.
 Along them a car takes a picture of 48x32 pixels and a scan of 16x90 rays every twenty metres, which
 rays cast at the mesh of the street give when they are asked for. The drive is cut into blocks of
@@ -55,7 +55,8 @@ from splatseg.street.radiance.options import RadianceOptions
 from splatseg.street.radiance.train import train_radiance
 from splatseg.street.shapes import ShapeAutoEncoder, load_shapes, sphere_code
 from splatseg.street.sources import scan_points
-from splatseg.synthetic import STREET_CLASSES, look_at, scene_mesh, street
+from splatseg.synthetic import look_at
+from splatseg_bench.worlds import STREET_CLASSES, scene_mesh, street
 
 LAYER = "semantic"
 PIECE = 200.0

@@ -26,7 +26,8 @@ from splatseg.core import Capture, LabelledMesh, LabelledPoints, View
 from splatseg.evaluate import PointSurfaceOptions, SurfaceField
 from splatseg.io.captures import read_capture
 from splatseg.io.surfaces import read_surface
-from splatseg.synthetic import cameras, cast, room, scene_mesh
+from splatseg.synthetic import cameras, cast, room
+from splatseg_bench.worlds import scene_mesh
 
 SCORE = Path(__file__).resolve().parents[1] / ".." / "shared" / "score" / "score.py"
 POINTS: tuple[tuple[str, dict], ...] = (

@@ -14,6 +14,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 CONFIGURATION = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 PROJECT = CONFIGURATION["project"]
+OURS = {"splatseg", "splatseg-bench"}
 EXTRAS: dict[str, list[str]] = PROJECT["optional-dependencies"]
 TOOLS = {  # of dev: programs, and what a test runs in a process of its own
     "import-linter", "pytest-xdist", "ruff", "pyright",
@@ -52,7 +53,10 @@ def statements(node: ast.AST) -> Iterator[ast.AST]:
 def distributions(modules: set[str]) -> set[str]:
     """The packages that bring modules; a module that none brings stands for itself."""
     known = packages_distributions()
-    return {normal(known[m][0] if m in known else m) for m in modules} - {"splatseg"}
+    return {normal(known[m][0] if m in known else m) for m in modules} - {
+        "splatseg",
+        "splatseg-bench",
+    }
 
 
 def normal(requirement: str) -> str:
@@ -71,6 +75,10 @@ def listed(*extras: str) -> set[str]:
 def test_the_package_lists_what_it_imports_and_nothing_else() -> None:
     optional = [extra for extra in EXTRAS if extra != "dev"]
     assert distributions(imported(ROOT / "src")) == listed(*optional)
+
+
+def test_benchmarks_import_what_splatseg_brings() -> None:
+    assert distributions(imported(ROOT / "bench")) <= listed()
 
 
 def test_dev_lists_what_the_tests_import_and_nothing_else() -> None:

@@ -15,6 +15,7 @@ import pytest
 import torch
 
 import splatseg
+import splatseg_bench
 from splatseg import cli
 
 PROJECT_ROOT = Path(__file__).resolve().parent.parent
@@ -25,8 +26,12 @@ NOT_EXAMPLES = {"splatseg.__main__", "splatseg.cli.__main__", "splatseg._native"
 
 
 def modules() -> list[str]:
-    found = pkgutil.walk_packages(splatseg.__path__, "splatseg.")
-    return ["splatseg", *sorted(module.name for module in found if module.name not in NOT_EXAMPLES)]
+    found = [
+        module.name
+        for package in (splatseg, splatseg_bench)
+        for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}.")
+    ]
+    return ["splatseg", *sorted(name for name in found if name not in NOT_EXAMPLES)]
 
 
 def source(name: str) -> str:
@@ -104,7 +109,7 @@ def test_readme_names_only_commands_and_flags_that_exist(
     lines = re.findall(r"^ *splatseg +(\S+)(.*)$", readme_code(), re.MULTILINE)
     assert len(lines) >= 5
     for name, rest in lines:
-        assert name in cli.COMMANDS, name
+        assert name in cli.find_commands(), name
         assert cli.main([name, "--help"]) == 0
         text = capsys.readouterr().out
         for flag in re.findall(r"(?<!\S)(--?[a-z][a-z-]*)", rest):

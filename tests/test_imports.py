@@ -88,6 +88,7 @@ def test_a_private_import_is_found(tmp_path) -> None:
         ("io/arrays.py", "import splatseg.io.layers", "does not know what they are of"),
         ("evaluate/metrics.py", "import splatseg.report", "Packages import downwards only"),
         ("tasks/segment.py", "import splatseg.cli", "Packages import downwards only"),
+        ("tasks/segment.py", "import splatseg_bench", "Benchmarks are another distribution"),
         ("render/paths.py", "import splatseg.models", "Packages import downwards only"),
     ],
 )

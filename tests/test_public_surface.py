@@ -10,6 +10,88 @@ import pytest
 
 import splatseg
 
+SURFACE = {
+    "AttachLayersOptions",
+    "Camera",
+    "Capture",
+    "CheckpointOptions",
+    "DemoOptions",
+    "EditOptions",
+    "EvaluationOptions",
+    "ExportOptions",
+    "FeatureMap",
+    "Features",
+    "FitOptions",
+    "Gaussians",
+    "ImportOptions",
+    "InputError",
+    "LabelMap",
+    "Labels",
+    "MakeSceneOptions",
+    "MaskSet",
+    "Method",
+    "MethodInputs",
+    "QueryOptions",
+    "RenderOptions",
+    "RenderingOptions",
+    "Scene",
+    "ScanLabelOptions",
+    "SeeOptions",
+    "SelectOptions",
+    "SharpenSceneOptions",
+    "SegmentOptions",
+    "Selection",
+    "Similarity",
+    "SplatsegError",
+    "StreetOptions",
+    "View",
+    "attach_layers",
+    "back_project",
+    "contributors",
+    "create_evidence",
+    "describe",
+    "edit_scene",
+    "evaluate_scene",
+    "examine_capture",
+    "export_scene",
+    "find_method",
+    "fit_capture",
+    "get_backend",
+    "import_scene",
+    "label_map",
+    "label_scans",
+    "load_layer",
+    "load_scene",
+    "load_scene_layer",
+    "make_demo",
+    "make_street_field",
+    "open_drive",
+    "open_evidence",
+    "open_selector",
+    "query",
+    "read_capture",
+    "read_splats",
+    "register_method",
+    "render_truth",
+    "render_views",
+    "save_label_map",
+    "save_layer",
+    "save_masks",
+    "save_scene",
+    "save_scene_layer",
+    "save_segmentation",
+    "save_street_field",
+    "see",
+    "segment",
+    "select",
+    "sharpen_scene",
+    "street_field",
+    "uplift",
+    "weights",
+    "write_capture",
+    "write_splats",
+}
+
 PACKAGES = {
     "core",
     "edit",
@@ -74,6 +156,12 @@ for name in {sorted(PACKAGES)}:
 def test_a_missing_name_is_an_attribute_error() -> None:
     with pytest.raises(AttributeError, match="No splatseg attribute Gausians"):
         splatseg.__getattr__("Gausians")
+
+
+@pytest.mark.parametrize("name", ["bench", "BenchOptions"])
+def test_what_moved_says_where(name: str) -> None:
+    with pytest.raises(AttributeError, match=f"is now splatseg_bench.{name}; install"):
+        getattr(splatseg, name)
 
 
 def test_no_public_name_hides_a_package() -> None:

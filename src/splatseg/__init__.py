@@ -16,4 +16,14 @@ Conventions (frames, pixel centres, units, ids): docs/conventions.md.
 
 import lazy_loader
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+_MOVED = ("bench", "BenchOptions")
+
+_load, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+
+def __getattr__(name: str) -> object:
+    if name in _MOVED:
+        raise AttributeError(
+            f"splatseg.{name} is now splatseg_bench.{name}; install splatseg-bench for it."
+        )
+    return _load(name)

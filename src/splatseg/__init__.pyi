@@ -58,7 +58,6 @@ from .render import get_backend as get_backend
 from .render import weights as weights
 from .synthetic import write_capture as write_capture
 from .tasks import AttachLayersOptions as AttachLayersOptions
-from .tasks import BenchOptions as BenchOptions
 from .tasks import CheckpointOptions as CheckpointOptions
 from .tasks import DemoOptions as DemoOptions
 from .tasks import EditOptions as EditOptions
@@ -75,7 +74,6 @@ from .tasks import SelectOptions as SelectOptions
 from .tasks import SharpenSceneOptions as SharpenSceneOptions
 from .tasks import StreetOptions as StreetOptions
 from .tasks import attach_layers as attach_layers
-from .tasks import bench as bench
 from .tasks import describe as describe
 from .tasks import edit_scene as edit_scene
 from .tasks import evaluate_scene as evaluate_scene

@@ -5,7 +5,7 @@ import subprocess
 
 import pytest
 
-from splatseg.cli import COMMANDS
+from splatseg.cli import COMMANDS, find_commands
 from splatseg.cli.completion import flags_by_command
 
 
@@ -29,7 +29,7 @@ def script(splatseg) -> str:
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
 def test_bash(script) -> None:
-    assert completed(script, "splatseg", "") == {*COMMANDS, "help"}
+    assert completed(script, "splatseg", "") == {*find_commands(), "help"}
     assert completed(script, "splatseg", "se") == {"see", "segment", "select"}
     assert {"--method", "--evidence"} <= completed(script, "splatseg", "segment", "--")
     assert completed(script, "splatseg", "segment", "S", "--evi") == {"--evidence"}
@@ -40,7 +40,7 @@ def test_bash(script) -> None:
 
 def test_every_command_and_its_flags_are_known(splatseg) -> None:
     flags = flags_by_command()
-    assert set(flags) == set(COMMANDS)
+    assert set(flags) == set(find_commands())
     assert "--occlusion" in flags["segment"], "flags of methods too"
     for shell in ("zsh", "fish"):
         text = splatseg("completion", shell)[1]

@@ -165,7 +165,7 @@ def test_ctrl_c_while_photographing_leaves_only_the_record(
     def stop(*_) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("splatseg.synthetic._capture.render_truth", stop)
+    monkeypatch.setattr("splatseg.synthetic.capture.render_truth", stop)
     assert main(["demo", "-o", str(tmp_path / "out"), *SMALL]) == 1
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["demo.json"]
 

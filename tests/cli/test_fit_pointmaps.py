@@ -18,7 +18,7 @@ from splatseg.io.images import load_image
 from splatseg.io.pointmaps import create_pointmaps
 from splatseg.io.scene import load_scene
 from splatseg.models import ENTRY_POINT_GROUP, _registry
-from splatseg.synthetic import PointmapErrors, SyntheticPointmaps, synthetic_pointmaps
+from splatseg_bench.worlds import PointmapErrors, SyntheticPointmaps, synthetic_pointmaps
 from support.pointmaps import camera_errors
 
 QUICK = ("--steps", 40, "--max-gaussians", 1500, "--backend", "cpu")

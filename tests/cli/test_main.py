@@ -104,6 +104,55 @@ def test_help_lists_every_command(word: str, capsys: pytest.CaptureFixture[str])
         assert re.search(rf"^  {name} +{re.escape(entry.summary)}$", text, re.MULTILINE)
 
 
+class Point:
+    """An entry point of another distribution."""
+
+    value = "elsewhere:ENTRY"
+
+    def __init__(self, name: str, found: object) -> None:
+        self.name = name
+        self._found = found
+
+    def load(self) -> object:
+        if isinstance(self._found, Exception):
+            raise self._found
+        return self._found
+
+
+@pytest.fixture
+def registered(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Let these be all the commands that other distributions register."""
+
+    def register(**found: object) -> None:
+        points = [Point(name, one) for name, one in found.items()]
+        monkeypatch.setattr(cli, "entry_points", lambda group: points)
+
+    return register
+
+
+def test_another_distribution_adds_a_command_and_replaces_none(registered) -> None:
+    entry = cli.CommandEntry(module="elsewhere", summary="counts sheep")
+    registered(sheep=entry, fit=entry)
+    assert cli.find_commands() == cli.COMMANDS | {"sheep": entry}
+    assert "\n  sheep       counts sheep\n" in cli.overview()
+
+
+@pytest.mark.parametrize(
+    ("found", "word", "status", "sentence"),
+    [
+        ({}, "bench", 2, "the command 'bench' is in another package; install splatseg-bench."),
+        ({"a": ImportError("no b")}, "a", 1,
+         "command 'a' (elsewhere:ENTRY) cannot be loaded: no b."),
+        ({"a": 3}, "a", 2,
+         "command 'a' (elsewhere:ENTRY): expected a splatseg.cli.CommandEntry, got int."),
+    ],
+)  # fmt: skip
+def test_a_command_that_is_not_there(registered, capsys, found, word, status, sentence) -> None:
+    registered(**found)
+    assert cli.main([word]) == status
+    assert capsys.readouterr().err == f"error: {sentence}\n"
+
+
 def test_no_command_is_a_usage_error(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main([]) == 2
     captured = capsys.readouterr()
@@ -127,7 +176,7 @@ def test_unknown_words_get_a_suggestion(
 
 def test_a_word_like_nothing_gets_the_list(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["qqqqq"]) == 2
-    assert f"known are {', '.join(cli.COMMANDS)}." in capsys.readouterr().err
+    assert f"known are {', '.join(cli.find_commands())}." in capsys.readouterr().err
 
 
 def test_words_become_the_dataclass(install_command: Callable[..., None]) -> None:

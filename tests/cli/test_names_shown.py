@@ -5,8 +5,9 @@ from types import SimpleNamespace
 import pytest
 
 from splatseg import cli
-from splatseg.cli import bench, evaluate
+from splatseg.cli import evaluate
 from splatseg.core import ClassTable
+from splatseg_bench import command as bench
 
 NAME = "[red]wall[/red] [/] \x1b[31m\u202e"
 SEEN = "[red]wall[/red] [/] \\x1b[31m\\u202e"

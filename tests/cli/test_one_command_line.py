@@ -17,7 +17,7 @@ from splatseg.io.scene import load_scene_layer
 
 CLI = Path(cli.__file__).parent
 MAKE = {
-    "attach", "bench", "demo", "edit", "evaluate", "export", "fit", "import", "query", "render",
+    "attach", "demo", "edit", "evaluate", "export", "fit", "import", "query", "render",
     "see", "segment", "select", "sharpen", "street",
 }  # fmt: skip
 TELL = {"doctor", "info"}
@@ -76,7 +76,7 @@ def test_shared_flags_have_the_shared_type(name) -> None:
         if field in declared and (name, field) not in OWN:
             assert declared[field] == kind, f"{name}: {field}"
             assert hasattr(_types, kind)
-    assert declared.get("data", "Data") == "Data" or name in {"bench", "doctor", "fit", "import"}
+    assert declared.get("data", "Data") == "Data" or name in {"doctor", "fit", "import"}
     assert declared.get("split", "Split") in {"Split", "SplitOrPath"}
 
 

@@ -4,12 +4,12 @@ import pytest
 import torch
 
 from splatseg.core import Features, Labels, MaskSet
-from splatseg.core.benchmark import TruePoints
 from splatseg.core.models import Boxes
 from splatseg.core.renderable import PointLabels
 from splatseg.errors import RangeError
 from splatseg.evaluate import psnr, ssim
 from splatseg.lift.relevancy import relevancy
+from splatseg_bench.scene import TruePoints
 
 IDS = torch.tensor([1, 2], dtype=torch.int32)
 SURE = torch.ones(2)

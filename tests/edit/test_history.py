@@ -311,21 +311,33 @@ def test_masks_are_refused_after_things_moved(document) -> None:
     [
         ({"kind": "explode"}, InputError, "expected one of extract, remove"),
         ({"kind": "remove"}, InputError, "remove: expected where, got none"),
-        ({"kind": "merge", "other": 3}, InputError, "other: expected a folder, got 3"),
+        ({"kind": "merge", "other": 3}, InputError, "other: expected .*, got 3"),
         ({"kind": "remove", "where": {"layer": "a"}, "other": "b"}, InputError, "takes no other"),
         ({"kind": "remove", "where": {"layer": "a", "x": 1}}, InputError, "got 'x'"),
-        ({"kind": "remove", "where": {"box": [0, 0, 0]}}, InputError, "a box of 6 numbers"),
+        (
+            {"kind": "remove", "where": {"box": [0, 0, 0]}},
+            InputError,
+            "box: expected a list of length 6",
+        ),
         ({"kind": "remove", "where": {"ids": [1]}}, InputError, "or another condition"),
-        ({"kind": "remove", "where": {"layer": "a", "ids": [1.5]}}, InputError, "list of integers"),
-        ({"kind": "remove", "where": {"layer": "a"}, "specks": 1.5}, InputError, "a number of"),
+        (
+            {"kind": "remove", "where": {"layer": "a", "ids": [1.5]}},
+            InputError,
+            "whole number, got 1.5",
+        ),
+        (
+            {"kind": "remove", "where": {"layer": "a"}, "specks": 1.5},
+            InputError,
+            "specks: .* got 1.5",
+        ),
         ({"kind": "remove", "where": {"layer": "a"}, "specks": -1}, RangeError, "0 or more"),
         ({"kind": "extract", "where": {"layer": "a"}, "specks": 9}, InputError, "takes no specks"),
-        ({"kind": "remove", "where": 3}, InputError, "where: expected an object, got 3"),
+        ({"kind": "remove", "where": 3}, InputError, "where: expected object .*, got 3"),
         ({"kind": "remove", "why": 3}, InputError, "expected the keys of an edit, got 'why'"),
         (
             {"kind": "transform", "transform": {"rotation": [[1, 0, 0]], "translation": [0, 0, 0]}},
             InputError,
-            "rotation: expected three rows",
+            "rotation: expected a list of length 3",
         ),
         (
             {
@@ -336,7 +348,7 @@ def test_masks_are_refused_after_things_moved(document) -> None:
                 },
             },
             RangeError,
-            "translation: expected finite numbers",
+            "translation: 1 of 3 values are not finite",
         ),
         (
             {
@@ -350,11 +362,15 @@ def test_masks_are_refused_after_things_moved(document) -> None:
             RangeError,
             "scale: expected more than 0, got 0",
         ),
-        ({"kind": "recolour", "recolour": {"colour": [1, 2]}}, InputError, "expected 3 numbers"),
+        (
+            {"kind": "recolour", "recolour": {"colour": [1, 2]}},
+            InputError,
+            "colour: expected a list of length 3",
+        ),
         (
             {"kind": "split", "where": {"layer": "a"}, "cut": {"by": "hand"}},
             InputError,
-            "expected masks, layer or box, got 'hand'",
+            "cut.by: .* got 'hand'",
         ),
         (
             {
@@ -363,7 +379,7 @@ def test_masks_are_refused_after_things_moved(document) -> None:
                 "cut": {"by": "box", "options": {"parts": True}},
             },
             InputError,
-            "expected a number as parts, got True",
+            "parts: expected a whole number, got True",
         ),
     ],
 )

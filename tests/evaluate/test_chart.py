@@ -5,7 +5,6 @@ import xml.etree.ElementTree as ElementTree
 
 import pytest
 
-from splatseg.errors import InputError, RangeError
 from splatseg.report.chart import (
     _BOTTOM,
     _HEIGHT,
@@ -84,10 +83,3 @@ def test_long_lines_are_thinned_but_keep_their_end() -> None:
     assert 400 <= len(places) <= 420
     assert len(set(places)) == len(places), "the end is there once"
     assert re.fullmatch(rf"{_WIDTH - _RIGHT:.1f},[\d.]+", places[-1])
-
-
-def test_refusals() -> None:
-    with pytest.raises(RangeError, match="finite"):
-        Line(name="x", points=((0, float("nan")),))
-    with pytest.raises(InputError, match="at least one point"):
-        Chart(title="x", across="", lines=(Line(name="x", points=()),))

@@ -7,7 +7,7 @@ from safetensors.torch import save_file
 from torch import nn
 
 from splatseg.errors import InputError, ShapeError
-from splatseg.evaluate.lpips import load_lpips
+from splatseg.evaluate.photographs import load_lpips
 
 ALEX_TAPS, VGG_TAPS = (1, 4, 7, 9, 11), (3, 8, 15, 22, 29)
 

@@ -34,8 +34,8 @@ from splatseg.io.evidence import (
 )
 from splatseg.io.images import save_png
 from splatseg.lift import GaussianField
-from splatseg.report import _segment_ids, _segment_panels, _segment_tables, segment_report
-from splatseg.report.layer_colours import layer_colours
+from splatseg.report import segment_report, segment_tables, segment_views
+from splatseg.report.colours import layer_colours
 from splatseg.report.segment_report import SegmentationRun, write_segmentation_report
 
 WIDTH, HEIGHT = 40, 30
@@ -323,7 +323,7 @@ def test_masks_are_painted_from_large_to_small(write) -> None:
     save_masks(MaskSet.from_dense(dense), folder, "v0")
     evidence = open_evidence(folder)
     assert isinstance(evidence, MaskEvidence)
-    ids = _segment_panels._evidence_ids(evidence, "v0")
+    ids = segment_views._evidence_ids(evidence, "v0")
     assert ids[22, 7] == 1
     assert ids[16, 7] == 2
     assert ids[3, 3] == -1
@@ -338,20 +338,20 @@ def test_ids_agree_by_their_names(write) -> None:
     save_label_map(LabelMap(ids=torch.ones(HEIGHT, WIDTH, dtype=torch.int32)), folder, "v0")
     source = open_evidence(folder)
     named = layer_of(write.scene)
-    assert _segment_ids.ids_agree(RenderableLayer.of(named), source, otherwise=False)
+    assert segment_report.ids_agree(RenderableLayer.of(named), source, otherwise=False)
     other = layer_of(write.scene, info={"names": {2: "blue wall"}})
-    assert not _segment_ids.ids_agree(RenderableLayer.of(other), source, otherwise=True)
+    assert not segment_report.ids_agree(RenderableLayer.of(other), source, otherwise=True)
     # A name of an id that is not in use is no contradiction.
     unused = layer_of(write.scene, info={"names": {2: "red <wall>", 77: "pole"}})
-    assert _segment_ids.ids_agree(RenderableLayer.of(unused), source, otherwise=False)
+    assert segment_report.ids_agree(RenderableLayer.of(unused), source, otherwise=False)
     for otherwise in (True, False):
         bare = layer_of(write.scene, info={"names": {}})
         assert (
-            _segment_ids.ids_agree(RenderableLayer.of(bare), source, otherwise=otherwise)
+            segment_report.ids_agree(RenderableLayer.of(bare), source, otherwise=otherwise)
             == otherwise
         )
         assert (
-            _segment_ids.ids_agree(RenderableLayer.of(named), Maps({}), otherwise=otherwise)
+            segment_report.ids_agree(RenderableLayer.of(named), Maps({}), otherwise=otherwise)
             == otherwise
         )
 
@@ -372,16 +372,16 @@ def test_confidence_bars_by_hand() -> None:
         confidence=torch.tensor([1.0, 0.95, 0.0, 0.5]),
         evidence=torch.tensor([1.0, 0.0, 3.0, 9.0]),
     )
-    rows = dict(_segment_tables.confidence_bars(labels).rows)
+    rows = dict(segment_tables.confidence_bars(labels).rows)
     assert rows["0.9 to 1.0"] == (pytest.approx(2 / 3), pytest.approx(1 / 4))
     assert rows["0.0 to 0.1"] == (pytest.approx(1 / 3), pytest.approx(3 / 4))
     assert rows["0.5 to 0.6"] == (0, 0)
     nothing = replace(labels, ids=torch.full((4,), -1))
-    assert set(_segment_tables.confidence_bars(nothing).rows[0][1]) == {0}
+    assert set(segment_tables.confidence_bars(nothing).rows[0][1]) == {0}
 
 
 def test_coverage_bars_by_hand() -> None:
-    rows = dict(_segment_tables.coverage_bars(torch.tensor([0, 1, 2, 7]), views=5).rows)
+    rows = dict(segment_tables.coverage_bars(torch.tensor([0, 1, 2, 7]), views=5).rows)
     assert rows == {
         "at least 1 view": (0.75,),
         "at least 2 views": (0.5,),

@@ -15,7 +15,7 @@ from splatseg.core import (
     TreeNode,
 )
 from splatseg.errors import InputError, ShapeError
-from splatseg.evaluate.held_out_segments import classes_of_instances
+from splatseg.evaluate.held_out import classes_of_instances
 from splatseg.lift import merge_panoptic
 
 FLOOR, WALL, CUP, CHAIR = 1, 2, 3, 4

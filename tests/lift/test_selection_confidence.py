@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from splatseg.core import Camera, Edited, Gaussians, LayerInfo, Selection
-from splatseg.edit._merge import merged_layers
+from splatseg.edit.operations import merged_layers
 from splatseg.io.export import label_columns
 from splatseg.io.layers import save_layer
 from splatseg.lift import GaussianField, attach, label_map

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from splatseg.core import Camera, Gaussians, View
-from splatseg.report.camera_map import _HELD_OUT, _TRAIN, camera_map
+from splatseg.report.maps import _HELD_OUT, _TRAIN, camera_map
 from splatseg.synthetic import look_at
 
 RED = torch.tensor([1.7, -1.7, -1.7])

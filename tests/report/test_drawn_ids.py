@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from splatseg.report.drawn_ids import draw_ids
+from splatseg.report.colours import draw_ids
 
 
 def test_each_wide_area_has_its_id_in_its_middle() -> None:

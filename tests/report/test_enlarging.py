@@ -4,10 +4,9 @@ import re
 
 import torch
 
-from splatseg.report._words import name_text
 from splatseg.report.html import Notice, Report, Table, report_html
 from splatseg.report.images import Gallery, GalleryImage
-from splatseg.report.words import counted
+from splatseg.report.words import counted, name_text
 
 
 def page_of(count: int) -> str:

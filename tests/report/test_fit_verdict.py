@@ -5,7 +5,7 @@ import pytest
 from splatseg.evaluate import PhotographReport
 from splatseg.evaluate.photographs import ViewScore
 from splatseg.fit import sensible_steps
-from splatseg.report.fit_verdict import MIN_PSNR, fit_verdict, scored_of
+from splatseg.report.fit_report import MIN_PSNR, fit_verdict, scored_of
 
 
 def scores(*values: float) -> PhotographReport:

@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from splatseg.core import ClassInfo, ClassTable, Gaussians, Labels, LayerInfo, RenderableLayer
-from splatseg.report.layer_colours import _oklab, layer_colours
-from splatseg.report.legend import colour_of, legend_of
+from splatseg.report.colours import _oklab, colour_of, layer_colours, legend_of
 
 
 def gaussians_at(means: torch.Tensor) -> Gaussians:

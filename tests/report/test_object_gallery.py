@@ -11,8 +11,8 @@ import torch
 from splatseg.core import Camera, Gaussians, Labels, LayerInfo, Scene, View
 from splatseg.io.images import save_png
 from splatseg.lift import GaussianField
-from splatseg.report import object_gallery, segment_report
-from splatseg.report.object_gallery import sightings
+from splatseg.report import objects, segment_report
+from splatseg.report.objects import sightings
 from splatseg.report.segment_report import SegmentationRun, write_segmentation_report
 
 WIDTH, HEIGHT = 48, 36
@@ -140,10 +140,9 @@ def test_a_thousand_objects_stay_bounded(scene, tmp_path, monkeypatch) -> None:
     """Only so many are shown, in pictures that grow smaller; the JSON has all."""
     ids = torch.arange(len(scene.gaussians)).int()
     labels = Labels(ids=ids, confidence=torch.ones(len(ids)))
-    monkeypatch.setattr(object_gallery, "_SIZES", ((10, 64), (50, 24)))
-    monkeypatch.setattr(object_gallery, "MAX_OBJECTS", 50)
+    monkeypatch.setattr(objects, "_SIZES", ((10, 64), (50, 24)))
+    monkeypatch.setattr(objects, "MAX_OBJECTS", 50)
     monkeypatch.setattr(segment_report, "MAX_OBJECTS", 50)
-    monkeypatch.setattr("splatseg.report._segment_page.MAX_OBJECTS", 50)
     page, record = written(scene, labels, tmp_path)
     cards = re.findall(r'<li id="object-\d+">', page)
     assert len(cards) == 50

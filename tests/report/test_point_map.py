@@ -5,7 +5,7 @@ import torch
 
 from splatseg.core import ClassInfo, ClassTable
 from splatseg.errors import ShapeError
-from splatseg.report.point_map import LabelledPoints, point_map
+from splatseg.report.maps import LabelledPoints, point_map
 
 RED, BLUE = (200, 10, 10), (10, 10, 200)
 CLASSES = ClassTable(

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from splatseg.core import Gaussians, Labels, Selection
+from splatseg.edit.document import where_from_json
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.selection import Where, select_where
 
@@ -58,7 +59,7 @@ def test_each_condition(gaussians, layers) -> None:
         expected = row_by_row(g, fits)
         assert 0 < sum(expected) < 200, where
         assert select_where(g, layers, where).mask.tolist() == expected, where
-        assert Where.from_json(json.loads(json.dumps(where.to_json(), allow_nan=False))) == where
+        assert where_from_json(json.loads(json.dumps(where.to_json(), allow_nan=False))) == where
 
 
 def test_combinations(gaussians, layers) -> None:
@@ -73,7 +74,7 @@ def test_combinations(gaussians, layers) -> None:
     nested = Where(any_of=(Where(any_of=(both, faint)),), layer="picked", invert=True)
     expected = ~((expected | found[faint]) & layers["picked"].mask)
     assert torch.equal(select_where(gaussians, layers, nested).mask, expected)
-    assert Where.from_json(json.loads(json.dumps(nested.to_json()))) == nested
+    assert where_from_json(json.loads(json.dumps(nested.to_json()))) == nested
     some = Selection(mask=torch.arange(200) < 100)
     assert torch.equal(
         select_where(gaussians, layers, ball, among=some).mask, found[ball] & some.mask
@@ -107,18 +108,18 @@ def test_bad_descriptions(options, error, message) -> None:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ({"sphere": [0, 0, 0]}, "a sphere of 4 numbers"),
-        ({"opacity": [0, True]}, "a opacity of 2 numbers"),
-        ({"size": "large"}, "a size of 2 numbers"),
-        ({"layer": "a", "invert": 1}, "invert true or false"),
-        ({"any_of": {"layer": "a"}}, "any_of as a list of objects"),
-        ({"any_of": [3]}, "any_of as a list of objects"),
+        ({"sphere": [0, 0, 0]}, "sphere: expected a list of length 4, got a list of 3"),
+        ({"opacity": [0, True]}, r"opacity\[1\]: expected a number, got True"),
+        ({"size": "large"}, "size: expected .*, got 'large'"),
+        ({"layer": "a", "invert": 1}, "invert: expected true or false, got 1"),
+        ({"any_of": {"layer": "a"}}, "any_of: expected a list"),
+        ({"any_of": [3]}, r"any_of\[0\]: expected an object, got 3"),
         ({"any_of": [{"colour": [0, 0, 0, 1]}]}, "got 'colour'"),
     ],
 )
 def test_hostile_json(content, message) -> None:
     with pytest.raises(InputError, match=message):
-        Where.from_json(content)
+        where_from_json(content)
 
 
 def test_layers_of_other_gaussians(gaussians) -> None:

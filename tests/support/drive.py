@@ -18,14 +18,8 @@ from PIL import Image
 
 from splatseg.core import View
 from splatseg.core.rigid import Similarity
-from splatseg.synthetic import (
-    SyntheticScene,
-    cast,
-    drive_cameras,
-    start_points,
-    street,
-    write_capture,
-)
+from splatseg.synthetic import SyntheticScene, cast, start_points, write_capture
+from splatseg_bench.worlds import drive_cameras, street
 from support.ply import write_ply
 
 VIEWS = 12

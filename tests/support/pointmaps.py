@@ -11,15 +11,8 @@ from PIL import Image
 from splatseg.core import Camera, Capture
 from splatseg.io.pointmaps import RecordedPointmaps, create_pointmaps
 from splatseg.pose.pointmaps._samples import PairSamples, PhotographSize, read_samples
-from splatseg.synthetic import (
-    PointmapErrors,
-    SyntheticPointmaps,
-    SyntheticScene,
-    cameras,
-    cast,
-    room,
-    synthetic_pointmaps,
-)
+from splatseg.synthetic import SyntheticScene, cameras, cast, room
+from splatseg_bench.worlds import PointmapErrors, SyntheticPointmaps, synthetic_pointmaps
 
 WIDTH, HEIGHT = 96, 72
 EXACT = PointmapErrors(noise=0, warp=0, wrong_confidence=0)

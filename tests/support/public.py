@@ -5,12 +5,12 @@ import importlib
 import inspect
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 PACKAGES = (
     "core",
     "render",
-    "io.benchmarks",
     "io.captures",
     "io.evidence",
     "io.export",
@@ -34,12 +34,19 @@ PACKAGES = (
     "edit",
     "evaluate",
     "tasks",
+    "splatseg_bench.layouts",
 )
+
+
+def imported(package: str) -> ModuleType:
+    """A package of splatseg, or of the distribution of benchmarks."""
+    whole = package if package.startswith("splatseg_bench") else f"splatseg.{package}"
+    return importlib.import_module(whole)
 
 
 def public_names(package: str) -> list[str]:
     """What an ``__init__`` re-exports as ``X as X``, or a module defines without underscore."""
-    module = importlib.import_module(f"splatseg.{package}")
+    module = imported(package)
     tree = ast.parse(Path(str(module.__file__)).read_text(encoding="utf-8"))
     exported = [
         alias.name
@@ -61,7 +68,7 @@ def public_callables() -> dict[str, Callable[..., Any]]:
     found: dict[str, Callable[..., Any]] = {}
     seen: set[int] = set()
     for package in PACKAGES:
-        module = importlib.import_module(f"splatseg.{package}")
+        module = imported(package)
         for name in public_names(package):
             value = getattr(module, name)
             ours = getattr(value, "__module__", "").startswith("splatseg")

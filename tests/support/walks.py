@@ -16,9 +16,9 @@ import torch
 
 from splatseg.core import Capture, Gaussians, Scene, View
 from splatseg.core.sh import SH_C0
-from splatseg.io.benchmarks import read_benchmark
 from splatseg.io.scene import save_scene
 from splatseg.synthetic import SyntheticScene, look_at, room, write_capture
+from splatseg_bench.layouts import read_benchmark
 from support import recorded
 from support.benchmark_layouts import read_source, write_layout
 from support.benchmark_layouts.evidence import write_evidence

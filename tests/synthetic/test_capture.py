@@ -140,7 +140,7 @@ def test_an_interrupted_writer_leaves_nothing_and_a_second_run_replaces(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("splatseg.synthetic._capture._ply", stop)
+        patch.setattr("splatseg.synthetic.capture._ply", stop)
         with pytest.raises(KeyboardInterrupt):
             write_capture(small_room, target, views=views[:2], points=20)
     assert list(tmp_path.iterdir()) == []

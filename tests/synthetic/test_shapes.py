@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from splatseg.errors import InputError, RangeError
-from splatseg.synthetic._shapes import SHAPES, Primitive, Texture, intersect, normals
+from splatseg.synthetic.solids import SHAPES, Primitive, Texture, intersect, normals
 
 INF = float("inf")
 

@@ -19,8 +19,8 @@ from splatseg.synthetic import (
     render_truth,
     room,
 )
-from splatseg.synthetic._shapes import TEXTURES, intersect
-from splatseg.synthetic._textures import pattern
+from splatseg.synthetic.shading import pattern
+from splatseg.synthetic.solids import TEXTURES, intersect
 
 CLASSES = ClassTable(rows=(ClassInfo(id=3, name="thing"), ClassInfo(id=5, name="ground")))
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from splatseg.io.images import save_png
-from splatseg.report.fit_verdict import MIN_PSNR
+from splatseg.report.fit_report import MIN_PSNR
 from splatseg.tasks import SegmentOptions, segment
 from splatseg.tasks.fit_quality import fit_quality
 from support.observers import Stopping

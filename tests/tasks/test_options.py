@@ -52,7 +52,8 @@ QUICK = FitOptions(minutes=None, steps=6, max_gaussians=300)
         (EditOptions, {"undo": True, "flat_colour": True}, "undo: takes no colours"),
         (EditOptions, {"scale": 2.0, "ids": (1,)}, "ids, names: expected `layer`"),
         (EditOptions, {"scale": 2.0, "invert": True}, "invert: expected `layer`"),
-        (EditOptions, {"scale": 2.0, "measure": -1}, "measure: expected 0 or more"),
+        (EditOptions, {"scale": 2.0, "specks": -1}, "specks: expected at least 0"),
+        (EditOptions, {"measure": 4}, "measure: this option was removed; pictures=0"),
     ],
 )
 def test_what_cannot_be_is_refused_before_the_work(kind, values, says) -> None:
@@ -193,10 +194,10 @@ def test_an_edit_says_what_was_done(made, tmp_path) -> None:
     assert [step["kind"] for step in done.operations] == ["extract", "transform"]
     assert done.operations[0]["selected"] == int((layer.ids == id).sum())
     assert done.operations[0]["split"] == 0
-    cut = EditOptions(extract=True, layer="classes", ids=(id,), cut="layer", measure=2)
+    cut = EditOptions(extract=True, layer="classes", ids=(id,), cut="layer")
     done = edit_scene(document, tmp_path / "cut", options=cut, backend="cpu")
     assert done.operations[0]["split"] > 0
-    assert done.operations[0]["views"] == 2
+    assert done.operations[0]["views"] == 3
     undone = edit_scene(
         load_document(tmp_path / "cut"), tmp_path / "back", options=EditOptions(undo=True)
     )

@@ -12,16 +12,17 @@ import errno
 import importlib
 import re
 import sys
-from collections.abc import Generator, Sequence
+from collections.abc import Collection, Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib.metadata import entry_points
 from typing import Any, Protocol, cast
 
 from splatseg.cli._pages import kept_page
 from splatseg.cli._signals import interrupted_by_signals
 from splatseg.cli._streams import prepare_streams, silence, tell
 from splatseg.cli._words import field_names, option_names, with_flags
-from splatseg.errors import InputError, SplatsegError, visible
+from splatseg.errors import InputError, MissingPackageError, SplatsegError, visible
 
 _MAX_UNPACKED = re.compile("--max-unpacked(=.*)?")
 
@@ -90,10 +91,6 @@ COMMANDS: dict[str, CommandEntry] = {
         module="splatseg.cli.evaluate",
         summary="score a layer against label maps of held-out views",
     ),
-    "bench": CommandEntry(
-        module="splatseg.cli.bench",
-        summary="methods under a published protocol, with the published figures beside",
-    ),
     "edit": CommandEntry(
         module="splatseg.cli.edit",
         summary="things removed, kept alone, copied, moved, coloured, joined -> a new scene",
@@ -115,7 +112,38 @@ COMMANDS: dict[str, CommandEntry] = {
         summary="a script that completes commands and flags in bash, zsh or fish",
     ),
 }
-"""Every command, in the order of the work."""
+"""Every command of this distribution, in the order of the work."""
+
+ENTRY_POINT_GROUP = "splatseg.commands"
+"""Where other distributions register commands: a name and its `CommandEntry`."""
+
+_ELSEWHERE = {"bench": "splatseg-bench"}
+"""Commands of other distributions of this project."""
+
+
+def find_commands() -> dict[str, CommandEntry]:
+    """All commands: those of this distribution, then those of other installed ones.
+
+    Raises:
+        MissingPackageError: If an installed distribution registers a command that cannot be loaded.
+    """
+    found = dict(COMMANDS)
+    for point in sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda point: point.name):
+        if point.name in found:  # nobody replaces a command of splatseg
+            continue
+        try:
+            entry: object = point.load()
+        except (ImportError, AttributeError) as error:
+            raise MissingPackageError(
+                f"command {point.name!r} ({point.value}) cannot be loaded: {error}."
+            ) from error
+        if not isinstance(entry, CommandEntry):
+            raise InputError(
+                f"command {point.name!r} ({point.value}): expected a splatseg.cli.CommandEntry, "
+                f"got {type(entry).__name__}."
+            )
+        found[point.name] = entry
+    return found
 
 
 class CommandModule(Protocol):
@@ -196,8 +224,9 @@ def entry_point() -> int:
 
 def overview() -> str:
     """The text of ``splatseg --help``: every command with its one line."""
-    width = max(len(name) for name in COMMANDS)
-    rows = "\n".join(f"  {name:<{width}}  {row.summary}" for name, row in COMMANDS.items())
+    commands = find_commands()
+    width = max(len(name) for name in commands)
+    rows = "\n".join(f"  {name:<{width}}  {row.summary}" for name, row in commands.items())
     return (
         "usage: splatseg COMMAND ...\n\n"
         "Segments 3D Gaussian scenes: which Gaussians are what, from posed photographs and what\n"
@@ -226,13 +255,14 @@ def _dispatch(words: list[str]) -> int:
     if name == "--version":
         print(f"splatseg {_version()}")
         return EXIT_DONE
-    if name not in COMMANDS:
-        raise InputError(_unknown(name))
+    commands = COMMANDS if name in COMMANDS else find_commands()
+    if name not in commands:
+        raise InputError(_unknown(name, commands))
     page = kept_page(name, rest)
     if page is not None:
         sys.stdout.write(page)
         return EXIT_DONE
-    module = cast("CommandModule", importlib.import_module(COMMANDS[name].module))
+    module = cast("CommandModule", importlib.import_module(commands[name].module))
     return _run(module, name, rest)
 
 
@@ -272,11 +302,13 @@ def _version() -> str:
     return version("splatseg")
 
 
-def _unknown(name: str) -> str:
+def _unknown(name: str, commands: Collection[str]) -> str:
+    if name in _ELSEWHERE:
+        return f"the command {name!r} is in another package; install {_ELSEWHERE[name]}."
     kind = "option" if name.startswith("-") else "command"
-    known = [*COMMANDS, "--help", "--version"]
+    known = [*commands, "--help", "--version"]
     close = difflib.get_close_matches(name, known, n=1)
-    hint = f"did you mean {close[0]!r}?" if close else f"known are {', '.join(COMMANDS)}."
+    hint = f"did you mean {close[0]!r}?" if close else f"known are {', '.join(commands)}."
     return f"unknown {kind} {name!r}; {hint}"
 
 

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from splatseg.cli import find_commands
 from splatseg.cli._pages import FOLDER
 
 Shell = Literal["bash", "zsh", "fish"]
@@ -42,7 +43,10 @@ def run(command: Command) -> None:
 
 
 def flags_by_command() -> dict[str, tuple[str, ...]]:
-    """The flags of each command, of all methods together, as its pages of help show them."""
+    """The flags of each command, of all methods together, as its pages of help show them.
+
+    Commands of other distributions have no page; they are completed by name.
+    """
     found: dict[str, set[str]] = {}
     for path in sorted(FOLDER.glob("*.txt")):
         command = path.stem.partition("-")[0]
@@ -50,6 +54,8 @@ def flags_by_command() -> dict[str, tuple[str, ...]]:
         for line in path.read_text(encoding="utf-8").splitlines():
             if _OPTION_LINE.match(line):
                 flags.update(_FLAG.findall(line))
+    for name in find_commands():
+        found.setdefault(name, set())
     return {name: tuple(sorted(flags)) for name, flags in found.items()}
 
 

@@ -19,7 +19,7 @@ from splatseg.cli._types import (
 )
 from splatseg.cli._work import ConsoleObserver, print_result, typed
 from splatseg.fit import FitOptions, Preset, Strategy
-from splatseg.report.fit_verdict import scored_of
+from splatseg.report.fit_report import scored_of
 from splatseg.tasks import MadeScene, MakeSceneOptions, fit_capture
 
 _DEFAULT = FitOptions()

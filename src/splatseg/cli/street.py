@@ -15,7 +15,7 @@ from splatseg.errors import InputError
 from splatseg.io.scans import Scans
 from splatseg.io.scene import scene_field_path
 from splatseg.io.scene_folder import is_scene
-from splatseg.report.point_map import LabelledPoints
+from splatseg.report.maps import LabelledPoints
 from splatseg.report.words import counted
 from splatseg.street.field import VERTEX_WORDS
 from splatseg.street.options import DnmpOptions

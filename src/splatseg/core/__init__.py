@@ -1,11 +1,5 @@
 """What things are: plain data and closed-form geometry. No files, no kernels."""
 
-from splatseg.core.benchmark import BenchmarkScene as BenchmarkScene
-from splatseg.core.benchmark import Scribble as Scribble
-from splatseg.core.benchmark import TargetTask as TargetTask
-from splatseg.core.benchmark import TrueMaps as TrueMaps
-from splatseg.core.benchmark import TrueMask as TrueMask
-from splatseg.core.benchmark import TruePoints as TruePoints
 from splatseg.core.camera import Camera as Camera
 from splatseg.core.camera import CameraModel as CameraModel
 from splatseg.core.edited import Edited as Edited

@@ -1,12 +1,9 @@
 """Edits as pure functions: Gaussians and their layers change in step, and a history replays."""
 
-from splatseg.edit._merge import merged_layers as merged_layers
-from splatseg.edit._operation import CutBy as CutBy
-from splatseg.edit._operation import Operation as Operation
-from splatseg.edit._operation import Recolour as Recolour
-from splatseg.edit._prepare import Prepared as Prepared
-from splatseg.edit._prepare import prepare as prepare
+from splatseg.edit.document import CutBy as CutBy
 from splatseg.edit.document import Document as Document
+from splatseg.edit.document import Operation as Operation
+from splatseg.edit.document import Recolour as Recolour
 from splatseg.edit.document import load_document as load_document
 from splatseg.edit.document import save_document as save_document
 from splatseg.edit.history import apply as apply
@@ -15,6 +12,9 @@ from splatseg.edit.history import undo as undo
 from splatseg.edit.operations import duplicate as duplicate
 from splatseg.edit.operations import extract as extract
 from splatseg.edit.operations import merge as merge
+from splatseg.edit.operations import merged_layers as merged_layers
 from splatseg.edit.operations import recolour as recolour
 from splatseg.edit.operations import remove as remove
 from splatseg.edit.operations import transform as transform
+from splatseg.edit.prepare import Prepared as Prepared
+from splatseg.edit.prepare import prepare as prepare

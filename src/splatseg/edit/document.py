@@ -1,15 +1,233 @@
-"""A scene with its layers, which edits change together."""
+"""A scene with its layers, and one edit of it in words that a file can hold."""
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, cast
 
-from splatseg.core import Edited, Layer, Scene, apply_rows
+import torch
+
+from splatseg.core import Edited, Layer, Scene, Similarity, apply_rows
 from splatseg.core.boundary import boundary, convert_fields
-from splatseg.errors import InputError, ShapeError
+from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.io.atomic import is_vacant
 from splatseg.io.scene import load_scene, load_scene_layer, save_scene, scene_layer_names
+from splatseg.io.schema import structured
+from splatseg.lift.boundaries.cut import CutOptions
+from splatseg.selection import Where
+
+_Three = tuple[float, float, float]
+Kind = Literal["extract", "remove", "duplicate", "transform", "recolour", "merge", "split"]
+
+_TAKES: dict[str, tuple[set[str], set[str]]] = {
+    "extract": ({"where"}, {"cut"}),
+    "remove": ({"where"}, {"cut", "specks"}),
+    "split": ({"where", "cut"}, set()),
+    "duplicate": ({"where", "transform"}, {"cut"}),
+    "transform": ({"transform"}, {"where", "cut"}),
+    "recolour": ({"recolour"}, {"where", "cut"}),
+    "merge": ({"other"}, {"transform"}),
+}
+"""What each kind must have and may have."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CutBy:
+    """How Gaussians at the boundary of what is selected are split before the edit."""
+
+    by: Literal["masks", "layer", "box"]
+    """The boundary: that of recorded label maps, of label maps that the layer itself draws in
+    the views, or of the box."""
+
+    evidence: str | None = None
+    """Name of the label maps, for masks."""
+
+    zero_is_class: bool = False
+    """How the label maps are opened, for masks: see `open_evidence`."""
+
+    views: tuple[str, ...] = ()
+    """Names of the views whose pixels count."""
+
+    options: CutOptions = field(default_factory=CutOptions)
+    """Which Gaussians are split, and how."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Recolour:
+    """Arguments of `recolour`."""
+
+    colour: _Three | None = None
+    """Red, green, blue in [0, 1] that the mean colour becomes."""
+
+    scale: _Three = (1.0, 1.0, 1.0)
+    """Factor of each channel."""
+
+    shift: _Three = (0.0, 0.0, 0.0)
+    """Added to each channel."""
+
+    view_dependent: bool = True
+    """Whether what changes with the direction stays."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Operation:
+    """One edit of a scene with its layers."""
+
+    kind: Kind
+    where: Where | None = None
+    """What it is of; None is everything, for kinds that allow it."""
+
+    transform: Similarity | None = None
+    """``target_from_source``; of the other scene, for a merge."""
+
+    recolour: Recolour | None = None
+    other: str | None = None
+    """Folder of the scene to merge."""
+
+    cut: CutBy | None = None
+    """How what straddles the boundary is split first; None splits nothing."""
+
+    specks: int | None = None
+    """Most Gaussians of a piece that goes along because it touches nothing but what is removed;
+    None leaves all pieces."""
+
+    def __post_init__(self) -> None:
+        convert_fields(self)
+        if self.kind not in _TAKES:
+            raise InputError(f"operation: expected one of {', '.join(_TAKES)}, got {self.kind!r}.")
+        must, may = _TAKES[self.kind]
+        given = {
+            name
+            for name in ("where", "transform", "recolour", "other", "cut", "specks")
+            if getattr(self, name) is not None
+        }
+        for name in sorted(must - given):
+            raise InputError(f"{self.kind}: expected {name}, got none.")
+        for name in sorted(given - must - may):
+            raise InputError(f"{self.kind}: takes no {name}.")
+        if self.specks is not None and self.specks < 0:
+            raise RangeError(f"specks: expected 0 or more, got {self.specks}.")
+        if self.cut is not None and self.where is None:
+            raise InputError(f"{self.kind}: expected where to cut, got none.")
+
+    def to_json(self) -> dict[str, Any]:
+        """As values that JSON holds. Inverse of `from_json`."""
+        content: dict[str, Any] = {"kind": self.kind}
+        if self.where is not None:
+            content["where"] = self.where.to_json()
+        if self.transform is not None:
+            content["transform"] = {
+                "rotation": self.transform.rotation.double().tolist(),
+                "translation": self.transform.translation.double().tolist(),
+                "scale": float(self.transform.scale),
+            }
+        if self.recolour is not None:
+            content["recolour"] = _lists(asdict(self.recolour))
+        if self.other is not None:
+            content["other"] = self.other
+        if self.cut is not None:
+            content["cut"] = _lists(asdict(self.cut))
+        if self.specks is not None:
+            content["specks"] = self.specks
+        return content
+
+    @classmethod
+    def from_json(cls, content: Mapping[str, Any]) -> "Operation":
+        """Read what `to_json` wrote; keys under ``result`` are left aside.
+
+        Raises:
+            InputError: If it is no operation.
+        """
+        unknown = sorted(set(content) - {f.name for f in fields(cls)} - {"result"})
+        if unknown:
+            raise InputError(f"operation: expected the keys of an edit, got {unknown[0]!r}.")
+        record = structured(content, _Record, where="operation")
+        moved = record.transform
+        return cls(
+            kind=cast("Kind", record.kind),
+            where=None if record.where is None else where_from_json(record.where),
+            transform=None if moved is None else moved.similarity(),
+            recolour=record.recolour,
+            other=record.other,
+            cut=record.cut,
+            specks=record.specks,
+        )
+
+
+def where_from_json(content: Mapping[str, Any]) -> Where:
+    """Inverse of `Where.to_json`.
+
+    Raises:
+        InputError: If it is nothing that it writes.
+    """
+    return structured(_finished(content), Where, where="where")
+
+
+def _finished(content: Mapping[str, Any]) -> dict[str, Any]:
+    """A description with infinity where JSON has null, as it knows no infinity."""
+    known = [f.name for f in fields(Where)]
+    unknown = sorted(set(content) - set(known))
+    if unknown:
+        # What is not understood would select something else.
+        raise InputError(f"where: expected {', '.join(known)}, got {unknown[0]!r}.")
+    found = dict(content)
+    for name in ("opacity", "size"):
+        match found.get(name):
+            case [low, None]:
+                found[name] = [low, math.inf]
+            case _:
+                pass
+    parts: Any = found.get("any_of")
+    if isinstance(parts, list):
+        found["any_of"] = [
+            _finished(cast("Mapping[str, Any]", part)) if isinstance(part, Mapping) else part
+            for part in cast("list[Any]", parts)
+        ]
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class _Transform:
+    """A similarity as JSON has it."""
+
+    rotation: tuple[_Three, _Three, _Three]
+    translation: _Three
+    scale: float = 1.0
+
+    def similarity(self) -> Similarity:
+        return Similarity(
+            rotation=torch.tensor(self.rotation, dtype=torch.float64),
+            translation=torch.tensor(self.translation, dtype=torch.float64),
+            scale=self.scale,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _Record:
+    """An operation as JSON has it."""
+
+    kind: str
+    where: dict[str, Any] | None = None
+    transform: _Transform | None = None
+    recolour: Recolour | None = None
+    other: str | None = None
+    cut: CutBy | None = None
+    specks: int | None = None
+
+
+def _lists(values: Any) -> Any:
+    """Tuples as lists, all the way down: what JSON gives back."""
+    if isinstance(values, Mapping):
+        table = cast("Mapping[str, Any]", values)
+        return {key: _lists(value) for key, value in table.items()}
+    if isinstance(values, (tuple, list)):
+        return [_lists(value) for value in cast("Sequence[Any]", values)]
+    return values
+
+
+# A scene with its layers, which edits change together.
+
 
 HISTORY = "edits"
 """Key of the provenance that holds the operations, first to last."""

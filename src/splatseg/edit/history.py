@@ -13,11 +13,17 @@ import torch
 
 from splatseg.core import Edited, Gaussians, Scene, Selection, Similarity
 from splatseg.core.boundary import boundary
-from splatseg.edit._merge import merged_layers
-from splatseg.edit._operation import Operation
-from splatseg.edit._prepare import Prepared, Progress, prepare
-from splatseg.edit.document import HISTORY, Document, load_document
-from splatseg.edit.operations import duplicate, extract, merge, recolour, remove, transform
+from splatseg.edit.document import HISTORY, Document, Operation, load_document
+from splatseg.edit.operations import (
+    duplicate,
+    extract,
+    merge,
+    merged_layers,
+    recolour,
+    remove,
+    transform,
+)
+from splatseg.edit.prepare import Prepared, Progress, prepare
 from splatseg.errors import InputError
 
 

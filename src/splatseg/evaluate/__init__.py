@@ -1,26 +1,21 @@
 """How good a result is: pure measures, and scenes held against truth on chosen views."""
 
-from splatseg.evaluate._panoptic_counts import PanopticCounts as PanopticCounts
 from splatseg.evaluate.agreement import contested as contested
 from splatseg.evaluate.agreement import views_that_show as views_that_show
 from splatseg.evaluate.boundary import BoundaryCounts as BoundaryCounts
 from splatseg.evaluate.boundary import BoundaryScore as BoundaryScore
 from splatseg.evaluate.boundary import boundary_overlap as boundary_overlap
 from splatseg.evaluate.boundary import boundary_score as boundary_score
-from splatseg.evaluate.frame_rate import frames_per_second as frames_per_second
 from splatseg.evaluate.held_out import BinaryReport as BinaryReport
+from splatseg.evaluate.held_out import InstanceReport as InstanceReport
+from splatseg.evaluate.held_out import PanopticReport as PanopticReport
+from splatseg.evaluate.held_out import PointReport as PointReport
 from splatseg.evaluate.held_out import SemanticReport as SemanticReport
 from splatseg.evaluate.held_out import evaluate_binary as evaluate_binary
+from splatseg.evaluate.held_out import evaluate_instances as evaluate_instances
+from splatseg.evaluate.held_out import evaluate_panoptic as evaluate_panoptic
+from splatseg.evaluate.held_out import evaluate_points as evaluate_points
 from splatseg.evaluate.held_out import evaluate_semantic as evaluate_semantic
-from splatseg.evaluate.held_out_segments import InstanceReport as InstanceReport
-from splatseg.evaluate.held_out_segments import PanopticReport as PanopticReport
-from splatseg.evaluate.held_out_segments import PointReport as PointReport
-from splatseg.evaluate.held_out_segments import evaluate_instances as evaluate_instances
-from splatseg.evaluate.held_out_segments import evaluate_panoptic as evaluate_panoptic
-from splatseg.evaluate.held_out_segments import evaluate_points as evaluate_points
-from splatseg.evaluate.learned import LearnedBytes as LearnedBytes
-from splatseg.evaluate.learned import learned_bytes as learned_bytes
-from splatseg.evaluate.matched_instances import matched_instance_score as matched_instance_score
 from splatseg.evaluate.metrics import BinaryScore as BinaryScore
 from splatseg.evaluate.metrics import Confusion as Confusion
 from splatseg.evaluate.metrics import SemanticScore as SemanticScore
@@ -34,6 +29,7 @@ from splatseg.evaluate.overlaps import InstanceScore as InstanceScore
 from splatseg.evaluate.overlaps import Overlaps as Overlaps
 from splatseg.evaluate.overlaps import instance_score as instance_score
 from splatseg.evaluate.panoptic import Detections as Detections
+from splatseg.evaluate.panoptic import PanopticCounts as PanopticCounts
 from splatseg.evaluate.panoptic import PanopticScore as PanopticScore
 from splatseg.evaluate.panoptic import PrecisionScore as PrecisionScore
 from splatseg.evaluate.panoptic import average_precision as average_precision
@@ -44,8 +40,6 @@ from splatseg.evaluate.photographs import PhotographReport as PhotographReport
 from splatseg.evaluate.photographs import ViewScore as ViewScore
 from splatseg.evaluate.photographs import evaluate_photographs as evaluate_photographs
 from splatseg.evaluate.photographs import render_and_photograph as render_and_photograph
-from splatseg.evaluate.solid import gaussian_score as gaussian_score
-from splatseg.evaluate.solid import gaussian_weights as gaussian_weights
-from splatseg.evaluate.solid import labels_from_points as labels_from_points
+from splatseg.evaluate.street_names import street_class as street_class
 from splatseg.evaluate.truth_maps import PointSurfaceOptions as PointSurfaceOptions
 from splatseg.evaluate.truth_maps import SurfaceField as SurfaceField

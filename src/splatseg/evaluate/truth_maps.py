@@ -16,15 +16,14 @@ References:
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from types import TracebackType
-from typing import Self
+from typing import Annotated, Self
 
 import torch
 from jaxtyping import Float, Int
+from msgspec import Meta
 from torch import Tensor
 
-from splatseg._check import check_range
 from splatseg.core import (
     UNLABELLED,
     Camera,
@@ -36,8 +35,9 @@ from splatseg.core import (
     RenderableLayer,
     ViewSignals,
 )
-from splatseg.core.boundary import boundary, convert_fields
-from splatseg.errors import InputError, RangeError
+from splatseg.core.boundary import boundary
+from splatseg.core.options import Positive, options
+from splatseg.errors import InputError
 from splatseg.neighbours import NeighbourIndex
 from splatseg.raycast import RayCaster
 
@@ -55,35 +55,25 @@ _CORNERS = 6
 _HEXAGON = ((0, 1, 2), (0, 2, 3), (0, 3, 4), (0, 4, 5))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@options
 class PointSurfaceOptions:
     """How labelled points become a surface."""
 
-    radius: float | None = None
+    radius: Positive | None = None
     """Of the hexagon that each point becomes, scene units. None takes `spread` times the distance
     to the point's `neighbours`-th neighbour, but no more than three times the median of that of
     its neighbours: points far from all others stay small."""
 
-    spread: float = 0.6
+    spread: Positive = 0.6
     """Of the radius where none is given: larger closes holes, smaller keeps outlines."""
 
-    neighbours: int = 6
+    neighbours: Annotated[int, Meta(ge=3)] = 6
     """Other points whose distance tells the radius and which tell the tangent plane of a point
     without a normal, at least 3."""
 
-    fill: int = 3
+    fill: Annotated[int, Meta(ge=0, le=1000)] = 3
     """Holes of up to twice so many pixels across, through which nothing or what is farther is seen,
     take label and depth of the nearest pixel that is near enough; 0 fills none."""
-
-    def __post_init__(self) -> None:
-        convert_fields(self)
-        if self.radius is not None and not 0 < self.radius < math.inf:
-            raise RangeError(f"radius: expected a positive length, got {self.radius:g}.")
-        if not 0 < self.spread < math.inf:
-            raise RangeError(f"spread: expected a positive number, got {self.spread:g}.")
-        if self.neighbours < 3:
-            raise RangeError(f"neighbours: expected at least 3, got {self.neighbours}.")
-        check_range("fill", self.fill, 0, 1000)
 
 
 class SurfaceField:

@@ -14,7 +14,7 @@ from splatseg._check import check_finite, check_shape
 from splatseg.core import Gaussians, Selection, View
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.selection.shapes import box_corners, check_ball
+from splatseg.selection.where import box_corners, check_ball
 
 _CORNERS = 3
 

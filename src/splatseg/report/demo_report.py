@@ -21,8 +21,7 @@ from splatseg.io.images import load_image, save_png
 from splatseg.io.json_files import read_json
 from splatseg.io.scene import load_scene, load_scene_layer
 from splatseg.lift import label_map
-from splatseg.report._common import environment, spread
-from splatseg.report.drawn_ids import draw_ids
+from splatseg.report.colours import colour_labels, draw_ids, layer_colours
 from splatseg.report.html import Bars, Commands, Figure, Legend, Report, Table, report_html
 from splatseg.report.images import (
     Gallery,
@@ -31,9 +30,7 @@ from splatseg.report.images import (
     contact_sheet,
     mark_errors,
 )
-from splatseg.report.layer_colours import layer_colours
-from splatseg.report.legend import colour_labels
-from splatseg.report.words import count_text, counted
+from splatseg.report.words import count_text, counted, environment, spread
 
 _HELD_OUT_ROWS = 6
 _TRAIN_ROWS = 4
@@ -109,8 +106,8 @@ def write_report(
             _score_table(figures),
             _step_table(figures),
             Commands(
-                title="The same from the shell",
-                lines=figures.commands,
+                "The same from the shell",
+                figures.commands,
                 note="What the demo ran after it had generated the capture.",
             ),
         ),
@@ -124,9 +121,9 @@ def _sheet(figures: DemoFigures, held_out: Gallery, classes: ClassTable) -> Tens
     """The contact sheet: some rows of the gallery under the figures that matter."""
     return contact_sheet(
         Gallery(
-            title="splatseg demo: a generated room, seen from held-out views",
-            columns=held_out.columns,
-            rows=spread(held_out.rows, _SHEET_ROWS),
+            "splatseg demo: a generated room, seen from held-out views",
+            held_out.columns,
+            spread(held_out.rows, _SHEET_ROWS),
         ),
         subtitle=(
             f"PSNR {figures.test['PSNR']:.1f} dB on "
@@ -143,32 +140,30 @@ def _figures(figures: DemoFigures, scene: Scene) -> tuple[Figure, ...]:
     before, after = figures.came.miou, figures.test["mIoU"]
     return (
         Figure(
-            label="Pictures of held-out views",
-            value=f"{figures.test['PSNR']:.1f} dB",
-            note=f"PSNR, mean of {counted(figures.test['photographs'], 'view')}; "
+            "Pictures of held-out views",
+            f"{figures.test['PSNR']:.1f} dB",
+            f"PSNR, mean of {counted(figures.test['photographs'], 'view')}; "
             f"SSIM {figures.test['SSIM']:.3f}",
         ),
         Figure(
-            label="Labels as they came",
-            value=f"{before:.3f}",
-            note="pooled mIoU of the machine labels, train views",
+            "Labels as they came", f"{before:.3f}", "pooled mIoU of the machine labels, train views"
         ),
         Figure(
-            label="Labels lifted and rendered",
-            value=f"{after:.3f}",
-            note=f"pooled mIoU on held-out views, {100 * (after - before):+.1f} points",
+            "Labels lifted and rendered",
+            f"{after:.3f}",
+            f"pooled mIoU on held-out views, {100 * (after - before):+.1f} points",
         ),
         Figure(
-            label="Objects, from masks without weights",
-            value=f"{figures.objects['mIoU']:.3f}",
-            note="instance mIoU on held-out views; "
+            "Objects, from masks without weights",
+            f"{figures.objects['mIoU']:.3f}",
+            "instance mIoU on held-out views; "
             f"{figures.objects['predicted_instances']} found, "
             f"{figures.objects['truth_instances']} true ones",
         ),
         Figure(
-            label="Gaussians",
-            value=count_text(len(scene.gaussians)),
-            note=f"from {len(scene.train_views)} photographs",
+            "Gaussians",
+            count_text(len(scene.gaussians)),
+            f"from {len(scene.train_views)} photographs",
         ),
     )
 
@@ -200,24 +195,21 @@ def _held_out_gallery(
             (
                 view.name,
                 (
-                    GalleryImage(image=photograph),
-                    GalleryImage(image=drawn, caption=f"{psnr(drawn, photograph):.1f} dB"),
-                    GalleryImage(image=colour_depth(depth, near=0.3, far=far)),
+                    GalleryImage(photograph),
+                    GalleryImage(drawn, f"{psnr(drawn, photograph):.1f} dB"),
+                    GalleryImage(colour_depth(depth, near=0.3, far=far)),
                     _labels(ids, scene.classes),
                     _labels(true, scene.classes),
                     GalleryImage(
-                        image=mark_errors(photograph, ids, truth=true),
-                        caption=f"{_right(ids, true):.1%} right",
+                        mark_errors(photograph, ids, truth=true), f"{_right(ids, true):.1%} right"
                     ),
-                    GalleryImage(
-                        image=draw_ids(colour_labels(things, colours), things), kind="chart"
-                    ),
+                    GalleryImage(draw_ids(colour_labels(things, colours), things), kind="chart"),
                 ),
             )
         )
     return Gallery(
-        title="Held-out views",
-        columns=(
+        "Held-out views",
+        (
             "photograph",
             "rendered",
             "depth",
@@ -226,7 +218,7 @@ def _held_out_gallery(
             "errors in red",
             "objects",
         ),
-        rows=tuple(rows),
+        tuple(rows),
         note="No photograph and no label of these views was used before. Objects come from masks "
         "that need no weights, joined in 3D; objects.html in scene/reports shows each of "
         "them by its number.",
@@ -244,7 +236,7 @@ def _train_gallery(scene: Scene, truth: Evidence, came: Evidence, labels: Labels
             (
                 view.name,
                 (
-                    GalleryImage(image=load_image(view)),
+                    GalleryImage(load_image(view)),
                     _labels(before, scene.classes, right=_right(before, true)),
                     _labels(after, scene.classes, right=_right(after, true)),
                     _labels(true, scene.classes),
@@ -252,9 +244,9 @@ def _train_gallery(scene: Scene, truth: Evidence, came: Evidence, labels: Labels
             )
         )
     return Gallery(
-        title="What lifting mends",
-        columns=("photograph", "labels as they came", "lifted and rendered", "truth"),
-        rows=tuple(rows),
+        "What lifting mends",
+        ("photograph", "labels as they came", "lifted and rendered", "truth"),
+        tuple(rows),
         note=(
             "Train views. Mistakes of single views are outvoted by the others; an object that "
             "is mistaken from most sides stays mistaken."
@@ -265,9 +257,9 @@ def _train_gallery(scene: Scene, truth: Evidence, came: Evidence, labels: Labels
 def _class_bars(figures: DemoFigures, classes: ClassTable) -> Bars:
     lifted: Mapping[str, float] = figures.test["per_class"]
     return Bars(
-        title="IoU of each class",
-        series=("as they came, train views", "lifted, held-out views"),
-        rows=tuple(
+        "IoU of each class",
+        ("as they came, train views", "lifted, held-out views"),
+        tuple(
             (row.name, (figures.came.per_class.get(row.id), lifted.get(str(row.id))))
             for row in classes.rows
         ),
@@ -283,9 +275,9 @@ def _score_table(figures: DemoFigures) -> Table:
     for views, of in (("train", figures.train), ("held out", figures.test)):
         rows.append(("lifted and rendered", views, of["mIoU"], of["fwIoU"], of["accuracy"]))
     return Table(
-        title="Class maps against the truth",
-        columns=("labels", "views", "mIoU", "fwIoU", "accuracy"),
-        rows=tuple(rows),
+        "Class maps against the truth",
+        ("labels", "views", "mIoU", "fwIoU", "accuracy"),
+        tuple(rows),
         note="Pooled over the pixels of all views of a row.",
     )
 
@@ -293,13 +285,13 @@ def _score_table(figures: DemoFigures) -> Table:
 def _step_table(figures: DemoFigures) -> Table:
     rows = [(name, f"{seconds:.1f}") for name, seconds in figures.steps]
     rows.append(("until this report", f"{time.monotonic() - figures.started:.1f}"))
-    return Table(title="Time", columns=("step", "seconds"), rows=tuple(rows))
+    return Table("Time", ("step", "seconds"), tuple(rows))
 
 
 def _facts(folder: Path, scene: Scene, seed: int) -> dict[str, Any]:
     capture = read_json(folder / "capture" / "metadata.json")
     return {
-        "room": f"splatseg.synthetic.room(seed={seed})",
+        "room": f"splatseg.synthetic.furnishing(seed={seed})",
         "photographs": f"{len(scene.train_views)} train and {len(scene.test_views)} held out, "
         f"{capture['width']} x {capture['height']} pixels",
         "fit": f"{scene.provenance.get('steps')} steps",
@@ -310,7 +302,7 @@ def _labels(
     ids: Int[Tensor, "height width"], classes: ClassTable | None, *, right: float | None = None
 ) -> GalleryImage:
     caption = "" if right is None else f"{right:.1%} right"
-    return GalleryImage(image=colour_labels(ids, classes), kind="chart", caption=caption)
+    return GalleryImage(colour_labels(ids, classes), kind="chart", caption=caption)
 
 
 def _right(ids: Tensor, truth: Tensor) -> float:

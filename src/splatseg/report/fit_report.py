@@ -1,21 +1,107 @@
-"""The report of a fit: what went in, what came out, how it went, and how good it is."""
+"""The report of a fit: what went in, what came out, how it went, and what it is good for."""
 
-import os
-import platform
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
-from importlib import metadata
 from typing import Any, cast
 
 from splatseg.core import Capture, View
 from splatseg.evaluate.photographs import PhotographReport
-from splatseg.fit import FitOptions, FitRecord, FitResult, reduction_note
+from splatseg.fit import FitOptions, FitRecord, FitResult, reduction_note, sensible_steps
 from splatseg.report.chart import Chart, Line
-from splatseg.report.fit_verdict import FitVerdict, fit_verdict, scored_of
 from splatseg.report.html import Bars, Block, Curves, Figure, Notice, Report, Table
 from splatseg.report.images import Gallery
-from splatseg.report.words import count_text
+from splatseg.report.words import count_text, counted, environment
+
+MIN_PSNR = 20.0
+"""Renders less like the photographs than this, in dB, carry labels badly: in scenes of known truth
+a fifth to two thirds of the mIoU of a longer fit was lost (``benchmarks/fit_length.py``, decision
+0025)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FitVerdict:
+    """What a fit is good for."""
+
+    words: str
+    """A word or two: ``Too short``."""
+
+    sentence: str
+    warns: bool
+    """Whether something is to be done before labels are put on it."""
+
+    too_short: bool
+    """Whether it has fewer steps than make sense."""
+
+    sensible_steps: int
+    """How many make sense for so many training views."""
+
+
+def fit_verdict(
+    *,
+    steps: int,
+    train_views: int,
+    interrupted: bool,
+    scores: PhotographReport | None,
+    held_out: int,
+) -> FitVerdict:
+    """Judge a fit by its length, and by its held-out views where there are scores.
+
+    Args:
+        steps: Steps done.
+        train_views: Training views with photographs.
+        interrupted: Whether it was stopped early.
+        scores: Of held-out views.
+        held_out: Held-out views there are, scored or not.
+    """
+    needed = sensible_steps(train_views)
+    short = steps < needed
+    of = "" if scores is None else _of(scores, held_out)
+    if short:
+        words = "Too short"
+        onwards = "--resume goes on" if interrupted else f"--steps {needed} or more is"
+        rest = " from here" if interrupted else " worth the time"
+        sentence = (
+            f"{counted(steps, 'step')} done, where {needed} or more make sense for "
+            f"{counted(train_views, 'training view')}; {onwards}{rest}.{of}"
+        )
+    elif scores is not None and scores.psnr < MIN_PSNR:
+        words = "Poor"
+        sentence = (
+            f"Renders are less like the photographs than the {MIN_PSNR:g} dB from which labels "
+            f"hold: too few photographs, wrong poses or moving things, see the worst views.{of}"
+        )
+    elif scores is None:
+        words = "Not judged"
+        sentence = "Long enough, but no held-out view was scored."
+    else:
+        words = "Good enough to carry labels"
+        sentence = of.strip()
+    poor = scores is not None and scores.psnr < MIN_PSNR
+    return FitVerdict(
+        words=words,
+        sentence=sentence,
+        warns=short or poor,
+        too_short=short,
+        sensible_steps=needed,
+    )
+
+
+def _of(scores: PhotographReport, held_out: int) -> str:
+    worst = min(scores.per_view, key=lambda score: score.psnr)
+    mean = f" PSNR {scores.psnr:.2f} dB, SSIM {scores.ssim:.3f} on {scored_of(scores, held_out)}"
+    return f"{mean}; the worst, {worst.name}, has {worst.psnr:.2f} dB."
+
+
+def scored_of(scores: PhotographReport, held_out: int) -> str:
+    """Of how many views scores are: ``12 held-out views``, ``5 of 12 held-out views``."""
+    if len(scores.views) == held_out:
+        return counted(held_out, "held-out view")
+    return f"{len(scores.views)} of {counted(held_out, 'held-out view')}"
+
+
+# The report of a fit: what went in, what came out, how it went, and how good it is.
+
 
 _LONG_LIST = 200
 
@@ -74,31 +160,32 @@ def fit_report(
         cameras: Where cameras stood.
     """
     result, scores = data.result, data.scores
+    minutes, seconds = divmod(round(result.seconds), 60)
     rate = result.steps / max(result.seconds, 1e-9)
     ended = "It was stopped early, and can go on with --resume. " if result.interrupted else ""
-    held_out = (
-        "Held-out views were not learned from."
-        if scores is not None
-        else "No held-out view was scored."
-    )
-    blocks: list[Block] = [] if pairs is None else [pairs]
+    scored = "No held-out view was scored."
     if scores is not None:
-        blocks.append(_score_table(scores))
-    if cameras is not None:
-        blocks.append(cameras)
-    curves = _curves(result.history)
-    if curves is not None:
-        blocks.append(curves)
-    blocks += [_stages(result), _time(data), _input(data), _output(data)]
-    blocks.append(_changed_options(data.options))
+        scored = "Held-out views were not learned from."
+    blocks: list[Block | None] = [
+        pairs,
+        None if scores is None else _score_table(scores),
+        cameras,
+        _curves(result.history) if result.history else None,
+        _stages(result),
+        _time(data),
+        _input(data),
+        _output(data),
+        _changed_options(data.options),
+    ]
     verdict = verdict_of(data)
     return Report(
         title=f"Fit of {data.capture.path.name}",
-        summary=f"{_length(result)}, {rate:.1f} steps a second. {ended}{held_out}",
+        summary=f"{result.steps} steps in {minutes} min {seconds:02d} s, {rate:.1f} steps a "
+        f"second. {ended}{scored}",
         command=data.command,
-        notices=(Notice(verdict=verdict.words, sentence=verdict.sentence, warns=verdict.warns),),
-        figures=_figures(data),
-        blocks=tuple(blocks),
+        notices=(Notice(verdict.words, verdict.sentence, warns=verdict.warns),),
+        figures=tuple(_figures(data)),
+        blocks=tuple(block for block in blocks if block is not None),
         facts=_facts(data),
     )
 
@@ -138,94 +225,62 @@ def fit_record(data: FitReportData) -> dict[str, Any]:
     }
 
 
-def _length(result: FitResult) -> str:
-    minutes, seconds = divmod(round(result.seconds), 60)
-    return f"{result.steps} steps in {minutes} min {seconds:02d} s"
-
-
-def _figures(data: FitReportData) -> tuple[Figure, ...]:
+def _figures(data: FitReportData) -> list[Figure]:
     result, scores = data.result, data.scores
     out: list[Figure] = []
     if scores is not None:
-        out.append(
-            Figure(
-                label="Held-out views",
-                value=f"{scores.psnr:.2f} dB",
-                note=f"PSNR, mean of {scored_of(scores, data.held_out)}; worst "
-                f"{scores.psnr_min:.2f} dB",
-            )
-        )
-        out.append(
-            Figure(
-                label="SSIM",
-                value=f"{scores.ssim:.3f}",
-                note=f"mean of {scored_of(scores, data.held_out)}",
-            )
-        )
+        of = f"mean of {scored_of(scores, data.held_out)}"
+        worst = f"PSNR, {of}; worst {scores.psnr_min:.2f} dB"
+        out.append(Figure("Held-out views", f"{scores.psnr:.2f} dB", worst))
+        out.append(Figure("SSIM", f"{scores.ssim:.3f}", of))
     if result.history:
-        out.append(
-            Figure(
-                label="Training views",
-                value=f"{result.history[-1].psnr:.2f} dB",
-                note="PSNR of the last 50 steps, before each was learned from",
-            )
-        )
-    out.append(
-        Figure(
-            label="Gaussians",
-            value=count_text(len(result.gaussians)),
-            note=f"{data.file_bytes / 1e6:.1f} MB",
-        )
-    )
-    return tuple(out)
+        note = "PSNR of the last 50 steps, before each was learned from"
+        out.append(Figure("Training views", f"{result.history[-1].psnr:.2f} dB", note))
+    size = f"{data.file_bytes / 1e6:.1f} MB"
+    return [*out, Figure("Gaussians", count_text(len(result.gaussians)), size)]
 
 
-def _curves(history: Sequence[FitRecord]) -> Curves | None:
+def _curves(history: Sequence[FitRecord]) -> Curves:
     """Loss, PSNR and count over minutes."""
-    if not history:
-        return None
+    minutes = [record.seconds / 60 for record in history]
 
     def chart(title: str, name: str, values: Sequence[float]) -> Chart:
-        minutes = [record.seconds / 60 for record in history]
-        line = Line(name=name, points=tuple(zip(minutes, values, strict=True)))
-        return Chart(title=title, across="minutes", lines=(line,))
+        return Chart(title, "minutes", (Line(name, tuple(zip(minutes, values, strict=True))),))
 
     return Curves(
-        title="How it went",
-        charts=(
+        "How it went",
+        (
             chart("Loss", "training views", [record.loss for record in history]),
             chart("PSNR, dB", "training views", [record.psnr for record in history]),
             chart("Gaussians", "count", [float(record.count) for record in history]),
         ),
-        note="Means of 50 steps, of training views at the resolution of the stage: where it "
+        "Means of 50 steps, of training views at the resolution of the stage: where it "
         "grows finer, the task gets harder.",
     )
 
 
 def _stages(result: FitResult) -> Bars:
     total = max(sum(result.stages.values()), 1e-9)
-    steps = max(1, result.steps)
+    step = 1e3 / max(1, result.steps)
     rows = sorted(result.stages.items(), key=lambda item: -item[1])
     return Bars(
-        title="Where the time of a step goes",
-        series=("share",),
-        rows=tuple(
-            (f"{name}, {1e3 * spent / steps:.1f} ms", (spent / total,)) for name, spent in rows
-        ),
-        note=f"Means over all steps; {1e3 * total / steps:.1f} ms a step together.",
+        "Where the time of a step goes",
+        ("share",),
+        tuple((f"{name}, {step * spent:.1f} ms", (spent / total,)) for name, spent in rows),
+        f"Means over all steps; {step * total:.1f} ms a step together.",
     )
 
 
 def _time(data: FitReportData) -> Table:
     """What each part of the command took; `--minutes` is the length of one of them."""
-    rows = [(name, _duration(spent)) for name, spent in data.timings.items()]
-    if len(rows) > 1:
-        rows.append(("together", _duration(sum(data.timings.values()))))
+    spent = dict(data.timings) or {"optimisation": data.result.seconds}
+    if len(spent) > 1:
+        spent["together"] = sum(spent.values())
     return Table(
-        title="Time",
-        columns=("part", "time"),
-        rows=tuple(rows or [("optimisation", _duration(data.result.seconds))]),
-        note="--minutes is the length of the optimisation; finding poses comes before it, scores "
+        "Time",
+        ("part", "time"),
+        tuple((name, _duration(seconds)) for name, seconds in spent.items()),
+        "--minutes is the length of the optimisation; finding poses comes before it, scores "
         "and this report after it.",
     )
 
@@ -236,11 +291,9 @@ def _duration(seconds: float) -> str:
 
 
 def _input(data: FitReportData) -> Table:
-    notes = (*data.capture.notes, *data.result.notes)
-    rows = [*_input_rows(data), *(("note", note) for note in notes)]
-    if data.poses is not None:
-        rows += _pose_rows(data.poses)
-    return Table(title="What was in", columns=("what", "value"), rows=tuple(rows))
+    notes = [("note", note) for note in (*data.capture.notes, *data.result.notes)]
+    poses = [] if data.poses is None else _pose_rows(data.poses)
+    return Table("What was in", ("what", "value"), (*_input_rows(data), *notes, *poses))
 
 
 def _input_rows(data: FitReportData) -> list[tuple[str, str]]:
@@ -275,7 +328,9 @@ def _pose_rows(poses: Mapping[str, Any]) -> list[tuple[str, str]]:
     for name, value in poses.items():
         words = f"{value:.3f}" if isinstance(value, float) else str(value)
         if name == "seconds" and isinstance(value, Mapping):
-            words = _pose_seconds(cast(Mapping[str, float], value))
+            seconds = cast(Mapping[str, float], value)
+            stages = ", ".join(f"{stage} {spent:.1f}" for stage, spent in seconds.items())
+            words = f"{sum(seconds.values()):.1f} s" + (f" ({stages})" if stages else "")
         elif isinstance(value, (list, tuple, dict)):
             words = f"{len(cast(Sequence[Any], value))}"
         if len(words) <= _LONG_LIST:
@@ -283,41 +338,29 @@ def _pose_rows(poses: Mapping[str, Any]) -> list[tuple[str, str]]:
     return rows
 
 
-def _pose_seconds(seconds: Mapping[str, float]) -> str:
-    """The whole, and the stages that it was made of."""
-    stages = ", ".join(f"{stage} {spent:.1f}" for stage, spent in seconds.items())
-    return f"{sum(seconds.values()):.1f} s" + (f" ({stages})" if stages else "")
-
-
 def _output(data: FitReportData) -> Table:
-    result = data.result
-    gaussians = result.gaussians
+    result, verdict = data.result, verdict_of(data)
+    ended = "as asked for, which is too short" if verdict.too_short else "as planned"
     rows = [
-        ("Gaussians", f"{len(gaussians)}"),
-        ("harmonics", f"degree {gaussians.sh_degree}"),
+        ("Gaussians", f"{len(result.gaussians)}"),
+        ("harmonics", f"degree {result.gaussians.sh_degree}"),
         ("file", f"{data.file_bytes / 1e6:.1f} MB"),
         ("steps", str(result.steps)),
-        ("steps that make sense", f"{verdict_of(data).sensible_steps} or more"),
+        ("steps that make sense", f"{verdict.sensible_steps} or more"),
         ("time", f"{result.seconds:.1f} s"),
-        ("ended", _ended(data)),
+        ("ended", "interrupted" if result.interrupted else ended),
     ]
     if data.scores is not None:
         rows.append(("held-out views scored", f"{len(data.scores.views)} of {data.held_out}"))
-    return Table(title="What came out", columns=("what", "value"), rows=tuple(rows))
-
-
-def _ended(data: FitReportData) -> str:
-    if data.result.interrupted:
-        return "interrupted"
-    return "as asked for, which is too short" if verdict_of(data).too_short else "as planned"
+    return Table("What came out", ("what", "value"), tuple(rows))
 
 
 def _score_table(scores: PhotographReport) -> Table:
     worst_first = sorted(scores.per_view, key=lambda score: score.psnr)
     return Table(
-        title="Scores of held-out views, the worst first",
-        columns=("view", "PSNR, dB", "SSIM"),
-        rows=tuple((score.name, score.psnr, score.ssim) for score in worst_first),
+        "Scores of held-out views, the worst first",
+        ("view", "PSNR, dB", "SSIM"),
+        tuple((score.name, score.psnr, score.ssim) for score in worst_first),
     )
 
 
@@ -331,19 +374,13 @@ def _changed_options(options: FitOptions) -> Table:
         if one.name in always or value != default:
             rows.append((one.name, str(value), str(default)))
     return Table(
-        title="Options",
-        columns=("option", "value", "default"),
-        rows=tuple(rows),
+        "Options",
+        ("option", "value", "default"),
+        tuple(rows),
         note="All others are as they come; fit.json lists every one.",
     )
 
 
 def _facts(data: FitReportData) -> dict[str, Any]:
-    return {
-        "seed": data.options.seed,
-        **data.facts,
-        "splatseg": metadata.version("splatseg"),
-        "torch": metadata.version("torch"),
-        "python": platform.python_version(),
-        "cores": os.cpu_count(),
-    }
+    versions = {name.lower(): value for name, value in environment().items()}
+    return {"seed": data.options.seed, **data.facts, **versions}

@@ -3,20 +3,25 @@
 Pure functions: pictures, tables and facts in, one string out.
 """
 
-from collections.abc import Mapping
+import base64
+import io
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
+from PIL import Image
+
 from splatseg.core import ClassTable
-from splatseg.errors import InputError
-from splatseg.report._page_style import PAGE_STYLE
-from splatseg.report._pictures import PictureHtml
-from splatseg.report._words import name_text, shown, text
 from splatseg.report.chart import Chart, chart_svg
-from splatseg.report.images import Gallery, ObjectGallery, Scale
-from splatseg.report.legend import colour_of
+from splatseg.report.colours import Colour, colour_of
+from splatseg.report.images import SHADES, Gallery, GalleryImage, ObjectCard, ObjectGallery, Scale
+from splatseg.report.words import name_text, shown, text
 
 Cell = str | int | float | None
+
+_STYLE = (Path(__file__).parent / "page.css").read_text(encoding="utf-8")
+"""Light and dark, wide and narrow, on paper; nothing is fetched."""
 
 _TALL = 40
 """Tables of more rows scroll within the page."""
@@ -32,19 +37,19 @@ _MIN_CONTENTS = 3
 """From so many sections on, a page begins with links to them."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Figure:
     """One number that matters, shown large at the top."""
 
+    label: str
     value: str
     """As it is read: ``29.4 dB``."""
 
-    label: str
     note: str = ""
     """A sentence that says how it came about or what it compares with."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Table:
     """Rows of numbers and words. Numbers stand right, None shows as a dash."""
 
@@ -53,16 +58,8 @@ class Table:
     rows: tuple[tuple[Cell, ...], ...]
     note: str = ""
 
-    def __post_init__(self) -> None:
-        for row in self.rows:
-            if len(row) != len(self.columns):
-                raise InputError(
-                    f"rows: expected {len(self.columns)} cells as there are columns, "
-                    f"got {len(row)} in the row of {row[0] if row else 'nothing'!r}."
-                )
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Bars:
     """Values in [0, 1] as bars, one group a row, one bar a series."""
 
@@ -73,18 +70,8 @@ class Bars:
 
     note: str = ""
 
-    def __post_init__(self) -> None:
-        for name, values in self.rows:
-            if len(values) != len(self.series):
-                raise InputError(
-                    f"rows: expected {len(self.series)} values as there are series, "
-                    f"got {len(values)} for {name!r}."
-                )
-            if any(value is not None and not 0 <= value <= 1 for value in values):
-                raise InputError(f"rows: expected values in [0, 1], got {values} for {name!r}.")
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Legend:
     """What the colours of label pictures mean."""
 
@@ -94,7 +81,7 @@ class Legend:
     """Whether ids stand before names; pictures have them."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Commands:
     """Lines that a reader can copy into a terminal."""
 
@@ -103,7 +90,7 @@ class Commands:
     note: str = ""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Curves:
     """Charts beside each other."""
 
@@ -112,7 +99,7 @@ class Curves:
     note: str = ""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Notice:
     """A sentence that is read before all else."""
 
@@ -127,7 +114,7 @@ class Notice:
 Block = Table | Bars | Curves | Gallery | ObjectGallery | Legend | Scale | Commands
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Report:
     """Everything on one page."""
 
@@ -173,7 +160,8 @@ def report_html(report: Report) -> str:
         else:
             sections.append((block.title, content))
     if report.facts:
-        sections.append(("How it was made", _facts(report.facts)))
+        rows = (f"<dt>{text(k)}</dt><dd>{text(shown(v))}</dd>" for k, v in report.facts.items())
+        sections.append(("How it was made", f"<dl>{''.join(rows)}</dl>"))
     titles = [title for title, _ in sections]
     if len(titles) >= _MIN_CONTENTS:
         links = "".join(f'<a href="#s{i}">{text(title)}</a>' for i, title in enumerate(titles))
@@ -190,7 +178,7 @@ def report_html(report: Report) -> str:
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{text(report.title)}</title>\n<style>{PAGE_STYLE}</style>\n</head>\n"
+        f"<title>{text(report.title)}</title>\n<style>\n{_STYLE}</style>\n</head>\n"
         f"<body>\n<main>\n{body}\n</main>\n</body>\n</html>\n"
     )
 
@@ -201,13 +189,6 @@ def _command(line: str) -> str:
         f'<span class="option">{text(word)}</span>' if word.startswith("-") else text(word)
         for word in line.split(" ")
     )
-
-
-def _facts(facts: Mapping[str, Any]) -> str:
-    rows = "".join(
-        f"<dt>{text(name)}</dt><dd>{text(shown(value))}</dd>" for name, value in facts.items()
-    )
-    return f"<dl>{rows}</dl>"
 
 
 def _notice(notice: Notice) -> str:
@@ -224,80 +205,76 @@ def _figure(figure: Figure) -> str:
     )
 
 
-def _block(block: Block, pictures: PictureHtml) -> str:
-    if isinstance(block, Table):
-        inner = _table(block)
-    elif isinstance(block, Bars):
-        inner = _bars(block)
-    elif isinstance(block, Curves):
-        inner = _curves(block)
-    elif isinstance(block, Gallery):
-        inner = pictures.gallery(block)
-    elif isinstance(block, ObjectGallery):
-        inner = pictures.objects(block)
-    elif isinstance(block, Legend):
-        inner = _legend(block)
-    elif isinstance(block, Scale):
-        inner = pictures.scale(block)
-    else:
-        inner = f"<pre>{chr(10).join(map(text, block.lines))}</pre>"
-    note = "" if isinstance(block, Legend) or not block.note else block.note
-    intro = f'<p class="note">{text(note)}</p>' if note else ""
+def _block(block: Block, pictures: "PictureHtml") -> str:
+    match block:
+        case Table():
+            inner = _table(block)
+        case Bars():
+            inner = _bars(block)
+        case Curves():
+            inner = _curves(block)
+        case Gallery():
+            inner = pictures.gallery(block)
+        case ObjectGallery():
+            inner = pictures.objects(block)
+        case Legend():
+            return _legend(block)
+        case Scale():
+            inner = pictures.scale(block)
+        case Commands():
+            inner = f"<pre>{chr(10).join(map(text, block.lines))}</pre>"
+    intro = f'<p class="note">{text(block.note)}</p>' if block.note else ""
     return f"{intro}{inner}"
 
 
 def _table(table: Table) -> str:
-    numeric = [
-        all(isinstance(row[i], int | float | None) for row in table.rows)
-        for i in range(len(table.columns))
-    ]
+    columns = range(len(table.columns))
+    numeric = [all(isinstance(row[i], int | float | None) for row in table.rows) for i in columns]
     kinds = [' class="number"' if number else "" for number in numeric]
     head = "".join(
         f'<th scope="col"{kind}>{text(name)}</th>'
         for name, kind in zip(table.columns, kinds, strict=True)
     )
-    rows = "".join(
-        "<tr>"
-        + "".join(
+    rows = [
+        "".join(
             f"<td{kind}>{text(shown(cell))}</td>" for cell, kind in zip(row, kinds, strict=True)
         )
-        + "</tr>"
         for row in table.rows
-    )
-    inside = f"<thead><tr>{head}</tr></thead><tbody>{rows}</tbody>"
-    tall = " tall" if len(table.rows) > _TALL else ""
+    ]
+    body = "".join(f"<tr>{cells}</tr>" for cells in rows)
+    tall = " tall" if len(rows) > _TALL else ""
     # What scrolls can be reached by keys.
-    opening = (
+    return (
         f'<div class="wide{tall}" tabindex="0" role="region" aria-label="{text(table.title)}">'
+        f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
     )
-    return f"{opening}<table>{inside}</table></div>"
+
+
+def _keys(entries: Iterable[tuple[str, str]]) -> str:
+    """Swatches, each an attribute that colours it, with a name."""
+    spans = "".join(f"<span><i {swatch}></i>{text(name)}</span>" for swatch, name in entries)
+    return f'<div class="keys">{spans}</div>'
 
 
 def _bars(bars: Bars) -> str:
-    keys = "".join(
-        f'<span><i class="series{i}"></i>{text(name)}</span>' for i, name in enumerate(bars.series)
-    )
     rows: list[str] = []
     for name, values in bars.rows:
         lines = "".join(
             f'<div class="bar-line"><i class="series{i}" '
-            f'style="width:{100 * (value or 0):.1f}%"></i>'
-            f"<b>{shown(value)}</b></div>"
+            f'style="width:{100 * (value or 0):.1f}%"></i><b>{shown(value)}</b></div>'
             for i, value in enumerate(values)
         )
         rows.append(f'<div class="name">{text(name)}</div><div class="group">{lines}</div>')
-    return f'<div class="keys">{keys}</div><div class="bars">{"".join(rows)}</div>'
+    keys = _keys((f'class="series{i}"', name) for i, name in enumerate(bars.series))
+    return f'{keys}<div class="bars">{"".join(rows)}</div>'
 
 
 def _curves(curves: Curves) -> str:
     figures: list[str] = []
     for chart in curves.charts:
         names = [line.name for line in chart.lines]
-        keys = "".join(
-            f'<span><i class="series{i + 1}"></i>{text(name)}</span>'
-            for i, name in enumerate(names)
-        )
-        key = f'<div class="keys">{keys}</div>' if len(names) > 1 else ""
+        entries = ((f'class="series{i}"', name) for i, name in enumerate(names, start=1))
+        key = _keys(entries) if len(names) > 1 else ""
         figures.append(
             f"<figure><figcaption>{text(chart.title)}</figcaption>{key}{chart_svg(chart)}</figure>"
         )
@@ -305,12 +282,111 @@ def _curves(curves: Curves) -> str:
 
 
 def _legend(legend: Legend) -> str:
-    entries: list[str] = []
+    entries: list[tuple[str, str]] = []
     for row in legend.classes.rows:
-        red, green, blue = colour_of(row.id, legend.classes)
-        said = not legend.with_ids or str(row.id) in row.name.split()
-        name = row.name if said else f"{row.id} {row.name}"
-        entries.append(
-            f'<span><i style="background:rgb({red},{green},{blue})"></i>{text(name)}</span>'
+        named = not legend.with_ids or str(row.id) in row.name.split()
+        swatch = f'style="background:{_rgb(colour_of(row.id, legend.classes))}"'
+        entries.append((swatch, row.name if named else f"{row.id} {row.name}"))
+    return _keys(entries)
+
+
+def _rgb(colour: Colour) -> str:
+    return f"rgb({','.join(map(str, colour))})"
+
+
+# A picture stands in an element with the attribute ``popover``; a button over it makes the browser
+# show that element above the page, and Escape puts it back. The bytes are in the page once.
+
+
+_JPEG_QUALITY = 86
+_SHORT = 8
+
+_LEAST_WIDTH = {2: 30, 3: 20, 4: 17, 5: 13, 6: 11.5}
+"""Least width of a picture, in letters' heights, where so many are to stand in one line."""
+
+
+def data_uri(panel: GalleryImage) -> str:
+    """The picture as a ``data:`` address: JPEG for a photo, PNG for a chart."""
+    file = io.BytesIO()
+    image = Image.fromarray(panel.image.cpu().numpy())
+    if panel.kind == "photo":
+        image.save(file, format="JPEG", quality=_JPEG_QUALITY)
+        kind = "jpeg"
+    else:
+        image.save(file, format="PNG", optimize=True)
+        kind = "png"
+    return f"data:image/{kind};base64,{base64.b64encode(file.getvalue()).decode('ascii')}"
+
+
+class PictureHtml:
+    """The pictures of one page; each has an id of its own there."""
+
+    def __init__(self) -> None:
+        self._count = 0
+
+    def gallery(self, gallery: Gallery) -> str:
+        """Rows with a heading each, and under it their pictures with the columns' names."""
+        rows: list[str] = []
+        least = _LEAST_WIDTH.get(len(gallery.columns))
+        width = "" if least is None else f' style="--least-width:{least}rem"'
+        for label, panels in gallery.rows:
+            shots = "".join(
+                self._shot(panel, column, f"{label}: {panel.caption or column}")
+                for panel, column in zip(panels, gallery.columns, strict=True)
+            )
+            head = f"<h3>{name_text(label)}</h3>"
+            rows.append(f'<div class="row">{head}<div class="shots"{width}>{shots}</div></div>')
+        return "".join(rows)
+
+    def objects(self, gallery: ObjectGallery) -> str:
+        """A list of objects."""
+        cards = "".join(self._card(card) for card in gallery.cards)
+        return f'<ul class="objects">{cards}</ul>'
+
+    def scale(self, scale: Scale) -> str:
+        """The shades from left to right, between what they stand for."""
+        stops = ",".join(map(_rgb, SHADES))
+        bar = f'<i style="background:linear-gradient(to right,{stops})"></i>'
+        return f'<div class="scale"><b>{text(scale.low)}</b>{bar}<b>{text(scale.high)}</b></div>'
+
+    def _shot(self, panel: GalleryImage, column: str, alternative: str) -> str:
+        words = " \N{MIDDLE DOT} ".join(
+            ([f"<b>{text(column)}</b>"] if column else [])
+            + ([text(panel.caption)] if panel.caption else [])
         )
-    return f'<div class="keys">{"".join(entries)}</div>'
+        caption = f"<figcaption>{words}</figcaption>" if words else ""
+        return f"<figure>{self._frame(panel, alternative)}{caption}</figure>"
+
+    def _frame(self, panel: GalleryImage, alternative: str) -> str:
+        self._count += 1
+        height, width = panel.image.shape[:2]
+        name, words = f"p{self._count}", text(alternative)
+        flat = ' class="flat"' if panel.kind == "chart" else ""
+        return (
+            f'<div class="frame" style="--aspect-ratio:{width}/{height}">'
+            f'<div class="zoom" popover id="{name}"><img{flat} src="{data_uri(panel)}" '
+            f'width="{width}" height="{height}" alt="{words}" loading="lazy">'
+            f'<div class="bar"><span>{words}</span><button type="button" '
+            f'popovertarget="{name}" popovertargetaction="hide">Close</button></div></div>'
+            f'<button type="button" class="open" popovertarget="{name}" '
+            f'aria-label="Enlarge {words}"></button></div>'
+        )
+
+    def _card(self, card: ObjectCard) -> str:
+        title = f"{card.id} {card.name}".strip()
+        if card.image is None:
+            picture = '<div class="unseen">in no view that was looked at</div>'
+        else:
+            picture = self._frame(card.image, f"object {title}")
+        swatch = f"background:{_rgb(card.colour)}"
+        facts = "".join(_fact(name, value) for name, value in card.facts)
+        return (
+            f'<li id="object-{card.id}">{picture}<h3><i style="{swatch}"></i>'
+            f"{name_text(title)}</h3><dl>{facts}</dl></li>"
+        )
+
+
+def _fact(name: str, value: str) -> str:
+    """A short value beside its name; a long one, such as a file, alone on its line."""
+    kind = ' class="long"' if len(value) > _SHORT else ""
+    return f"<dt{kind}>{text(name)}</dt><dd{kind}>{name_text(value)}</dd>"

@@ -3,16 +3,17 @@
 from dataclasses import dataclass
 from typing import Literal
 
+import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from splatseg._check import check_shape
 from splatseg.core import ClassTable
 from splatseg.errors import InputError
-from splatseg.report.legend import NOTHING, Colour, colour_labels, colour_of
+from splatseg.report.colours import NOTHING, Colour, colour_labels, colour_of
 
 _Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
 
@@ -34,7 +35,7 @@ _MARGIN = 20
 _GAP = 6
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class GalleryImage:
     """An image for a page or sheet."""
 
@@ -53,7 +54,7 @@ class GalleryImage:
             raise InputError(f"image: expected 8-bit colours (uint8), got {self.image.dtype}.")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class Gallery:
     """Rows of pictures under common column titles: one row a view, say."""
 
@@ -64,16 +65,8 @@ class Gallery:
 
     note: str = ""
 
-    def __post_init__(self) -> None:
-        for label, panels in self.rows:
-            if len(panels) != len(self.columns):
-                raise InputError(
-                    f"rows: expected {len(self.columns)} pictures as there are columns, "
-                    f"row {label!r} has {len(panels)}."
-                )
 
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class ObjectCard:
     """One object of a layer, as a page shows it."""
 
@@ -91,7 +84,7 @@ class ObjectCard:
     """What is known of it: names and values."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class ObjectGallery:
     """Objects beside each other."""
 
@@ -100,7 +93,7 @@ class ObjectGallery:
     note: str = ""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Scale:
     """What the shades of `colour_share` mean."""
 
@@ -303,3 +296,60 @@ def _fitting(
     while text and draw.textlength(text + "...", font=font) > width:
         text = text[:-1]
     return text.rstrip() + "..."
+
+
+# A view with a selection outlined and the prompts that made it.
+
+
+_OUTLINE = (255, 214, 10)
+_POSITIVE = (52, 199, 89)
+_NEGATIVE = (226, 48, 48)
+_EDGE = (16, 16, 20)
+_DIMMED = 0.45
+
+
+def selection_picture(
+    image: UInt8[Tensor, "height width 3"],
+    mask: Bool[Tensor, "height width"],
+    *,
+    points: Float[Tensor, "p 2"] | None = None,
+    positive: Bool[Tensor, "p"] | None = None,
+    polygons: tuple[Float[Tensor, "corners 2"], ...] = (),
+    strokes: Bool[Tensor, "height width"] | None = None,
+    negative_strokes: Bool[Tensor, "height width"] | None = None,
+) -> UInt8[Tensor, "height width 3"]:
+    """Draw what is selected bright within a yellow outline, the rest dimmed, prompts on top.
+
+    Args:
+        image: The view.
+        mask: What is selected of it.
+        points: Clicks, x and y in pixels: discs, green on the thing and red beside it.
+        positive: Whether each click is on the thing; None means that all are.
+        polygons: Boxes and lassos, corners in pixels.
+        strokes: Pixels of strokes on the thing.
+        negative_strokes: Pixels of strokes beside it.
+
+    Raises:
+        ShapeError: If the mask has not the image's size.
+    """
+    check_shape("mask", mask, tuple(image.shape[:2]))
+    lit = np.where(mask.numpy()[..., None], 1.0, _DIMMED)
+    colours = (image.numpy() * lit + 0.5).astype(np.uint8)
+    for pixels, colour in ((strokes, _POSITIVE), (negative_strokes, _NEGATIVE)):
+        if pixels is not None:
+            colours[pixels.numpy()] = colour
+    inner = mask.numpy().astype(np.uint8)
+    edge = inner - cv2.erode(inner, np.ones((3, 3), np.uint8), borderValue=0)
+    colours[edge > 0] = _OUTLINE
+    picture = Image.fromarray(colours)
+    draw = ImageDraw.Draw(picture)
+    for polygon in polygons:
+        corners = [(float(x), float(y)) for x, y in polygon.tolist()]
+        draw.line([*corners, corners[0]], fill=_POSITIVE, width=2)
+    if points is not None:
+        signs = torch.ones(len(points)).bool() if positive is None else positive
+        radius = max(3.0, min(image.shape[:2]) / 100)
+        for (x, y), sign in zip(points.tolist(), signs.tolist(), strict=True):
+            where = (x - radius, y - radius, x + radius, y + radius)
+            draw.ellipse(where, fill=_POSITIVE if sign else _NEGATIVE, outline=_EDGE, width=1)
+    return torch.from_numpy(np.array(picture))

@@ -24,8 +24,8 @@ from splatseg.core import (
 from splatseg.errors import InputError, SplatsegError
 from splatseg.io.images import load_image
 from splatseg.render import render
-from splatseg.report._words import text
-from splatseg.report.legend import colour_labels, colour_of
+from splatseg.report.colours import colour_labels, colour_of
+from splatseg.report.words import text
 
 _SIDE = 240
 """Longest side of a picture, pixels."""

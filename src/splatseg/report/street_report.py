@@ -1,16 +1,16 @@
 """The page of a mesh field of a drive: what was built, how it went, and what it shows."""
 
 import math
+import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from splatseg.core import ClassTable
-from splatseg.report._common import environment
 from splatseg.report.chart import Chart, Line
 from splatseg.report.html import Block, Curves, Figure, Legend, Notice, Report, Table
 from splatseg.report.images import Gallery
-from splatseg.report.words import count_text, counted
+from splatseg.report.words import count_text, counted, environment
 from splatseg.street.geometry import GeometryRecord
 from splatseg.street.radiance import RadianceRecord
 
@@ -145,36 +145,34 @@ def street_report(
         views: Photographs, renders, depth and label maps of some views.
         above: Labelled points from above.
     """
-    blocks: list[Block] = [] if views is None else [views]
-    legend = Legend(classes=data.classes)
-    if views is not None and data.classes.rows:
-        blocks.append(legend)
-    if above is not None:
-        blocks.append(above)
-        blocks += [legend] if views is None and data.classes.rows else []
-    blocks += [] if data.points is None else [_point_table(data, data.points)]
-    if data.points is not None and data.points.scores:
-        blocks.append(_score_table(data.points))
-    blocks += [_levels(data)] if data.levels else []
-    blocks += [_depths(data)] if data.depth else []
+    legend = Legend(data.classes) if data.classes.rows else None
+    points = data.points
     charts = _charts(data)
-    if charts:
-        blocks.append(
-            Curves(
-                title="How it went",
-                charts=charts,
-                note="Shapes are fitted to depth level by level, then colours and classes are "
-                f"learned. Means of at most {_BINS} parts of the training each.",
-            )
-        )
-    blocks += [_times(data)] if data.timings else []
+    how = Curves(
+        "How it went",
+        charts,
+        "Shapes are fitted to depth level by level, then colours and classes are "
+        f"learned. Means of at most {_BINS} parts of the training each.",
+    )
+    blocks: list[Block | None] = [
+        views,
+        None if views is None else legend,
+        above,
+        legend if views is None and above is not None else None,
+        None if points is None else _point_table(data, points),
+        _score_table(points) if points is not None and points.scores else None,
+        _levels(data) if data.levels else None,
+        _depths(data) if data.depth else None,
+        how if charts else None,
+        _times(data) if data.timings else None,
+    ]
     return Report(
         title=f"Street {data.scene}",
         summary=_summary(data),
         command=data.command,
         notices=data.notices,
-        figures=_figures(data),
-        blocks=tuple(blocks),
+        figures=tuple(_figures(data)),
+        blocks=tuple(block for block in blocks if block is not None),
         facts={**data.facts, **environment()},
     )
 
@@ -207,63 +205,51 @@ def street_record(data: StreetReportData) -> dict[str, Any]:
 
 
 def _summary(data: StreetReportData) -> str:
-    said: list[str] = []
+    sentences: list[str] = []
     if data.name:
         of = f" in {counted(data.blocks, 'block')}" if data.blocks else ""
         count = len(data.classes.rows)
         classes = "1 class" if count == 1 else f"{count} classes"
-        said.append(
-            f"Field {data.name}: {counted(data.primitives, 'primitive')}{of} with {classes}."
-        )
+        primitives = counted(data.primitives, "primitive")
+        sentences.append(f"Field {data.name}: {primitives}{of} with {classes}.")
     if data.points is not None:
-        said.append(
-            f"{counted(data.points.points, 'point')} of {counted(data.points.scans, 'scan')} "
-            f"labelled by {data.points.by}."
-        )
-    return " ".join(said)
+        points, scans = counted(data.points.points, "point"), counted(data.points.scans, "scan")
+        sentences.append(f"{points} of {scans} labelled by {data.points.by}.")
+    return " ".join(sentences)
 
 
-def _figures(data: StreetReportData) -> tuple[Figure, ...]:
+def _figures(data: StreetReportData) -> list[Figure]:
     figures: list[Figure] = []
     if data.name:
-        figures.append(Figure(value=count_text(data.primitives), label="primitives"))
+        figures.append(Figure("primitives", count_text(data.primitives)))
     before, after = _medians(data.depth)
     if after is not None:
         note = "" if before is None else f"median; {before:.2f} m before shapes were fitted"
-        figures.append(Figure(value=f"{after:.2f} m", label="error of depth", note=note))
+        figures.append(Figure("error of depth", f"{after:.2f} m", note))
     if data.psnr:
         mean = math.fsum(data.psnr.values()) / len(data.psnr)
-        figures.append(
-            Figure(
-                value=f"{mean:.1f} dB",
-                label="PSNR",
-                note=f"of the {counted(len(data.psnr), 'training view')} shown",
-            )
-        )
+        note = f"of the {counted(len(data.psnr), 'training view')} shown"
+        figures.append(Figure("PSNR", f"{mean:.1f} dB", note))
     if data.points is not None and data.points.points:
         share = 1 - data.points.unlabelled / data.points.points
-        figures.append(Figure(value=f"{share:.1%}", label="points with a label"))
-    return tuple(figures)
+        figures.append(Figure("points with a label", f"{share:.1%}"))
+    return figures
 
 
 def _medians(rows: Sequence[DepthError]) -> tuple[float | None, float | None]:
     """Medians over views of the errors before and after."""
-    return _median([row.before for row in rows]), _median([row.after for row in rows])
-
-
-def _median(values: Sequence[float | None]) -> float | None:
-    known = sorted(value for value in values if value is not None)
-    if not known:
-        return None
-    half = len(known) // 2
-    return known[half] if len(known) % 2 else (known[half - 1] + known[half]) / 2
+    before = [row.before for row in rows if row.before is not None]
+    after = [row.after for row in rows if row.after is not None]
+    return statistics.median(before) if before else None, (
+        statistics.median(after) if after else None
+    )
 
 
 def _levels(data: StreetReportData) -> Table:
     return Table(
-        title="Primitives",
-        columns=("level", "side of voxels, m", "of voxels", "kept"),
-        rows=tuple(
+        "Primitives",
+        ("level", "side of voxels, m", "of voxels", "kept"),
+        tuple(
             (i, f"{level.side:g}", level.started, level.kept) for i, level in enumerate(data.levels)
         ),
         note="0 is the finest level. What stood before measured surfaces or around a camera was "
@@ -277,9 +263,9 @@ def _depths(data: StreetReportData) -> Table:
         for row in data.depth
     ]
     return Table(
-        title="Error of depth",
-        columns=("view", "rays", "before, m", "after, m", "met before", "met after"),
-        rows=tuple(rows),
+        "Error of depth",
+        ("view", "rays", "before, m", "after, m", "met before", "met after"),
+        tuple(rows),
         note="Median distance between where rays first meet a primitive and their known depth, "
         "before shapes were fitted and after, over the rays that meet one, and the share of these. "
         "Views that were learned from; primitives around cameras are left out.",
@@ -295,18 +281,18 @@ def _point_table(data: StreetReportData, points: PointCounts) -> Table:
     ]
     rows.append(("without a label", None, points.unlabelled, points.unlabelled / total))
     return Table(
-        title="Points by class",
-        columns=("class", "id", "points", "share"),
-        rows=tuple(rows),
+        "Points by class",
+        ("class", "id", "points", "share"),
+        tuple(rows),
         note=f"Of {counted(points.scans, 'scan')}; the labels are in {points.folder}.",
     )
 
 
 def _score_table(points: PointCounts) -> Table:
     return Table(
-        title="Points against their truth",
-        columns=("points", "number", "mIoU", "accuracy", "without a label"),
-        rows=tuple((s.points, s.count, s.miou, s.accuracy, s.undefined) for s in points.scores),
+        "Points against their truth",
+        ("points", "number", "mIoU", "accuracy", "without a label"),
+        tuple((s.points, s.count, s.miou, s.accuracy, s.undefined) for s in points.scores),
         note="Seen are points that a view which was learned from shows, by "
         f"{points.sight}: no more than 0.1 m and 3 % behind it. A point without a label is wrong.",
     )
@@ -320,16 +306,14 @@ def _charts(data: StreetReportData) -> tuple[Chart, ...]:
         for record in shaped:
             loss = record.loss * data.metres_per_unit
             by_level.setdefault(record.level, []).append((float(record.step), loss))
-        lines = tuple(
-            Line(name=f"level {level}", points=tuple(points)) for level, points in by_level.items()
-        )
-        charts.append(Chart(title="Error of depth, m", across="steps of a level", lines=lines))
+        lines = tuple(Line(f"level {level}", tuple(points)) for level, points in by_level.items())
+        charts.append(Chart("Error of depth, m", "steps of a level", lines))
     learned = _thinned(data.training)
     for title, column in (("Squared error of colours", 1), ("Cross-entropy of classes", 2)):
         points = tuple((row[0], row[column]) for row in learned if math.isfinite(row[column]))
         if points:
-            line = Line(name=title, points=points)
-            charts.append(Chart(title=title, across="steps", lines=(line,)))
+            line = Line(title, points)
+            charts.append(Chart(title, "steps", (line,)))
     return tuple(charts)
 
 
@@ -350,4 +334,4 @@ def _thinned(records: Sequence[RadianceRecord]) -> list[tuple[float, float, floa
 def _times(data: StreetReportData) -> Table:
     rows = [(name, round(spent, 1)) for name, spent in data.timings.items()]
     rows.append(("together", round(math.fsum(data.timings.values()), 1)))
-    return Table(title="Time", columns=("stage", "seconds"), rows=tuple(rows))
+    return Table("Time", ("stage", "seconds"), tuple(rows))

@@ -8,8 +8,8 @@ from splatseg.selection.components import components as components
 from splatseg.selection.components import leftovers as leftovers
 from splatseg.selection.components import pieces as pieces
 from splatseg.selection.components import touching as touching
-from splatseg.selection.select_where import ids_named as ids_named
-from splatseg.selection.select_where import layer_called as layer_called
-from splatseg.selection.select_where import select_where as select_where
-from splatseg.selection.shapes import box_corners as box_corners
 from splatseg.selection.where import Where as Where
+from splatseg.selection.where import box_corners as box_corners
+from splatseg.selection.where import ids_named as ids_named
+from splatseg.selection.where import layer_called as layer_called
+from splatseg.selection.where import select_where as select_where

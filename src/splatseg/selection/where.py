@@ -1,15 +1,75 @@
-"""A set of Gaussians by description: conditions, all or any of which must hold."""
+"""Sets of Gaussians by description: conditions, all or any of which must hold."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Any, cast
+from typing import Any
 
-from splatseg.errors import InputError
-from splatseg.selection.shapes import box_corners, check_ball, check_interval
+import torch
+from torch import Tensor
 
-_WIDTHS = {"box": 6, "sphere": 4, "opacity": 2, "size": 2, "colour_near": 4, "component_at": 3}
-"""Conditions that are numbers, and how many."""
+from splatseg.core import (
+    ClassTable,
+    FlatLayer,
+    Gaussians,
+    Labels,
+    Layer,
+    Selection,
+    flat_layer,
+    layer_address,
+)
+from splatseg.core.boundary import boundary
+from splatseg.errors import InputError, RangeError, ShapeError
+from splatseg.selection.components import components
+
+
+def box_corners(low: Sequence[float], high: Sequence[float]) -> tuple[Tensor, Tensor]:
+    """Corners of a box as float64, after a check that there is something between them.
+
+    Raises:
+        ShapeError: If they are no two points.
+        RangeError: If a number is not finite, or the box is empty.
+    """
+    lower = torch.tensor([float(v) for v in low], dtype=torch.float64)
+    upper = torch.tensor([float(v) for v in high], dtype=torch.float64)
+    if lower.shape != (3,) or upper.shape != (3,):
+        raise ShapeError(f"box: expected two points, got {len(lower)} and {len(upper)} numbers.")
+    if not bool(torch.isfinite(lower).all() and torch.isfinite(upper).all()):
+        raise RangeError(f"box: expected finite numbers, got {lower.tolist()}, {upper.tolist()}.")
+    if not bool((lower < upper).all()):
+        raise RangeError(
+            "box: expected a first corner below the second along every axis, got "
+            f"{lower.tolist()} and {upper.tolist()}."
+        )
+    return lower, upper
+
+
+def check_ball(name: str, values: Sequence[float]) -> None:
+    """A point and how far from it, finite and positive.
+
+    Raises:
+        RangeError: If it is not.
+    """
+    if not all(math.isfinite(v) for v in values) or values[-1] <= 0:
+        raise RangeError(f"{name}: expected a point and a positive distance, got {list(values)}.")
+
+
+def check_interval(name: str, values: Sequence[float]) -> None:
+    """A least and a greatest number, the greatest possibly infinite.
+
+    Raises:
+        RangeError: If it is not.
+    """
+    low, high = values
+    if not (math.isfinite(low) and low <= high):
+        raise RangeError(f"{name}: expected a least and a greatest number, got {low}, {high}.")
+
+
+# A set of Gaussians by description: conditions, all or any of which must hold.
+
+
+_NUMBERS = ("box", "sphere", "opacity", "size", "colour_near", "component_at")
+"""Conditions that are numbers."""
 
 _FLAGS = ("largest_component", "invert")
 
@@ -94,7 +154,7 @@ class Where:
             content["layer"] = self.layer
         if self.ids:
             content["ids"] = list(self.ids)
-        for name in _WIDTHS:
+        for name in _NUMBERS:
             if (numbers := getattr(self, name)) is not None:
                 # JSON has no infinity: null is no upper end.
                 content[name] = [float(v) if math.isfinite(v) else None for v in numbers]
@@ -103,57 +163,158 @@ class Where:
         content |= {name: True for name in _FLAGS if getattr(self, name)}
         return content
 
-    @classmethod
-    def from_json(cls, content: Mapping[str, Any]) -> "Where":
-        """Inverse of `to_json`.
 
-        Raises:
-            InputError: If it is nothing that `to_json` writes.
-        """
-        known = [f.name for f in fields(cls)]
-        unknown = sorted(set(content) - set(known))
-        if unknown:
-            raise InputError(f"where: expected {', '.join(known)}, got {unknown[0]!r}.")
-        layer, ids = content.get("layer"), content.get("ids", [])
-        if not (layer is None or isinstance(layer, str)):
-            raise InputError("where: expected the name of a layer.")
-        if not isinstance(ids, list) or not all(map(_is_integer, cast("list[Any]", ids))):
-            raise InputError(f"where: expected ids as a list of integers, got {ids!r:.60}.")
-        flags = {name: content.get(name, False) for name in _FLAGS}
-        for name, value in flags.items():
-            if not isinstance(value, bool):
-                raise InputError(f"where: expected {name} true or false, got {value!r:.60}.")
-        parts = content.get("any_of", [])
-        if not isinstance(parts, list) or not all(
-            isinstance(part, Mapping) for part in cast("list[Any]", parts)
-        ):
-            raise InputError(f"where: expected any_of as a list of objects, got {parts!r:.60}.")
-        numbers = {name: _numbers(name, content.get(name)) for name in _WIDTHS}
-        return cls(
-            layer=layer,
-            ids=tuple(cast("list[int]", ids)),
-            any_of=tuple(map(cls.from_json, cast("list[Mapping[str, Any]]", parts))),
-            **cast("dict[str, Any]", numbers),
-            **flags,
-        )
+@boundary
+def select_where(
+    gaussians: Gaussians,
+    layers: Mapping[str, Layer],
+    where: Where,
+    *,
+    among: Selection | None = None,
+) -> Selection:
+    """The Gaussians that a description means; it may be none of them.
+
+    Args:
+        gaussians: The Gaussians of the scene.
+        layers: Its layers by name, of which a description may speak.
+        where: The description.
+        among: A condition more: only these fit. None is all.
+
+    Raises:
+        InputError: If there is no such layer, it is one of features, ids are missing or not
+            wanted, or the layer has none of an id.
+        ShapeError: If the layer is of other Gaussians.
+    """
+    mask = _fitting(gaussians, layers, where)
+    if among is not None:
+        mask &= among.mask
+    if where.largest_component or where.component_at is not None:
+        mask = _one_piece(gaussians, mask, where)
+    return Selection(mask=~mask if where.invert else mask)
 
 
-def _is_integer(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool)
+def _fitting(gaussians: Gaussians, layers: Mapping[str, Layer], where: Where) -> Tensor:
+    """Which Gaussians (n,) fit all conditions, before pieces and the rest are looked at."""
+    mask = torch.ones(len(gaussians), dtype=torch.bool)
+    if where.layer is not None:
+        layer = layer_called(layers, where.layer)
+        if len(layer) != len(gaussians):
+            raise ShapeError(
+                f"layer {where.layer!r}: expected {len(gaussians)} rows, got {len(layer)}."
+            )
+        mask &= _of_layer(layer, where)
+    centres = gaussians.means.double()
+    if where.box is not None:
+        low, high = box_corners(where.box[:3], where.box[3:])
+        mask &= ((centres >= low) & (centres <= high)).all(dim=1)
+    if where.sphere is not None:
+        mask &= _near(centres, where.sphere)
+    if where.colour_near is not None:
+        mask &= _near(gaussians.colours.double(), where.colour_near)
+    for interval, values in (
+        (where.opacity, gaussians.opacities),
+        (where.size, gaussians.scales.amax(dim=1)),
+    ):
+        if interval is not None:
+            mask &= (values >= interval[0]) & (values <= interval[1])
+    if where.any_of:
+        found = [select_where(gaussians, layers, part).mask for part in where.any_of]
+        mask &= torch.stack(found).any(dim=0)
+    return mask
 
 
-def _numbers(name: str, value: Any) -> tuple[float, ...] | None:
-    """Numbers of a condition; null within a range is infinity."""
-    if value is None:
-        return None
-    width = _WIDTHS[name]
-    values = cast("list[Any]", value) if isinstance(value, list) else []
-    if name in ("size", "opacity") and len(values) == 2 and values[1] is None:
-        values = [values[0], math.inf]
-    good = len(values) == width and all(
-        isinstance(v, (int, float)) and not isinstance(v, bool) and not math.isnan(v)
-        for v in values
-    )
-    if not good:
-        raise InputError(f"where: expected a {name} of {width} numbers, got {value!r:.60}.")
-    return tuple(float(v) for v in values)
+def _near(points: Tensor, ball: Sequence[float]) -> Tensor:
+    """Which points (n, 3) lie within a distance of a point."""
+    centre = torch.tensor(ball[:3], dtype=torch.float64)
+    return torch.linalg.vector_norm(points - centre, dim=1) <= ball[3]
+
+
+def _one_piece(gaussians: Gaussians, mask: Tensor, where: Where) -> Tensor:
+    """Of what is selected the largest connected piece, or that at a point."""
+    if not bool(mask.any()):
+        return mask
+    piece_of = components(gaussians, Selection(mask=mask))
+    if where.component_at is None:
+        wanted = int(torch.bincount(piece_of[mask]).argmax())
+    else:
+        point = torch.tensor(where.component_at, dtype=torch.float64)
+        away = torch.linalg.vector_norm(gaussians.means.double() - point, dim=1)
+        wanted = int(piece_of[torch.where(mask, away, torch.inf).argmin()])
+    return piece_of == wanted
+
+
+@boundary
+def layer_called(layers: Mapping[str, Layer], address: str) -> FlatLayer:
+    """The layer of this name; of a tree its objects, or the level after an @.
+
+    Raises:
+        InputError: If there is none.
+    """
+    name, level = layer_address(address)
+    if name not in layers:
+        known = ", ".join(layers) or "there is none"
+        raise InputError(f"layer: expected one of the scene ({known}), got {name!r}.")
+    return flat_layer(layers[name], level, name=name)
+
+
+def _of_layer(layer: FlatLayer, where: Where) -> Tensor:
+    match layer:
+        case Selection():
+            if where.ids:
+                raise InputError(f"ids: layer {where.layer!r} is a selection, which has no ids.")
+            return layer.mask
+        case Labels():
+            if not where.ids:
+                raise InputError(f"ids: expected at least one id of layer {where.layer!r}.")
+            present = set(torch.unique(layer.ids).tolist())
+            unknown = [i for i in where.ids if i not in present]
+            if unknown:
+                known = sorted(present - {-1})
+                shown = ", ".join(map(str, known[:20])) + (", ..." if len(known) > 20 else "")
+                raise InputError(
+                    f"ids: layer {where.layer!r} has no Gaussian with id {unknown[0]}; "
+                    f"it has {shown or 'none'}."
+                )
+            return torch.isin(layer.ids, torch.tensor(where.ids, dtype=layer.ids.dtype))
+        case _:
+            raise InputError(
+                f"layer {where.layer!r}: expected labels or a selection, got features."
+            )
+
+
+@boundary
+def ids_named(
+    labels: Labels, names: Sequence[str], *, classes: ClassTable | None = None
+) -> tuple[int, ...]:
+    """Ids of a layer whose name is one of `names`, by its own record or the class table.
+
+    A name may be that of several objects; all of them are meant.
+
+    Raises:
+        InputError: If no id has one of the names.
+    """
+    known = dict(labels.info.names)
+    if not known and classes is not None:
+        known = {row.id: row.name for row in classes.rows}
+    present = set(labels.present.tolist())
+    found: list[int] = []
+    for name in names:
+        ids = [i for i, own_name in known.items() if own_name == name and i in present]
+        if not ids:
+            own_names = {n for i, n in known.items() if i in present}
+            raise InputError(
+                f"names: expected names of the layer ({_shown(own_names, name)}), got {name!r}."
+            )
+        found += ids
+    return tuple(sorted(set(found)))
+
+
+_SHOWN = 8
+"""Most names that a message lists."""
+
+
+def _shown(names: set[str], asked: str) -> str:
+    """Names for a message, those first that share words with what was asked for."""
+    words = set(asked.lower().split())
+    order = sorted(names, key=lambda name: (-len(words & set(name.lower().split())), name))
+    return ", ".join([*order[:_SHOWN], *(["..."] if len(order) > _SHOWN else [])]) or "none"

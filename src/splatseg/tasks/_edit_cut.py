@@ -99,14 +99,16 @@ def _masks(document: Document, where: Where, cut: Cut) -> CutBy | None:
     )
 
 
-def measured_change(
-    before: Document, split: Document, *, views: int, backend: BackendName
-) -> dict[str, float]:
+_MEASURED_VIEWS = 4
+"""Training views in which the change by a cut alone is measured."""
+
+
+def measured_change(before: Document, split: Document, *, backend: BackendName) -> dict[str, float]:
     """PSNR between renders before and after the split, and of each against photographs."""
     pool = before.scene.train_views or before.scene.views
-    if not pool or not views:
+    if not pool:
         return {}
-    spaced = pool[:: math.ceil(len(pool) / views)]
+    spaced = pool[:: math.ceil(len(pool) / _MEASURED_VIEWS)]
     pairs = (before.scene.gaussians, split.scene.gaussians)
     squares = 0.0
     for view in spaced:

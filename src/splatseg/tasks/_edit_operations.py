@@ -144,6 +144,5 @@ def _recolour(options: EditOptions) -> Recolour:
     return Recolour(
         colour=options.colour,
         scale=options.colour_scale or (1.0, 1.0, 1.0),
-        shift=options.colour_shift or (0.0, 0.0, 0.0),
         view_dependent=not options.flat_colour,
     )

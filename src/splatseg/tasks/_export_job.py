@@ -16,7 +16,7 @@ from splatseg.io.export import (
     objects_of,
 )
 from splatseg.render import BackendName
-from splatseg.report.legend import names_of
+from splatseg.report.colours import names_of
 from splatseg.tasks._observer import Observer
 from splatseg.tasks.export_options import ExportOptions, What
 from splatseg.tasks.label_columns import label_tables

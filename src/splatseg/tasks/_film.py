@@ -15,8 +15,8 @@ from splatseg.io.cameras import cameras_content
 from splatseg.io.images import check_encoder, write_video
 from splatseg.io.json_files import read_json, write_json
 from splatseg.render.paths import camera_path, is_forward_facing
+from splatseg.report.colours import colour_labels
 from splatseg.report.images import colour_depth
-from splatseg.report.legend import colour_labels
 
 # Depths beyond these shares of all are shown in the end colours.
 _NEAR, _FAR = 0.01, 0.99

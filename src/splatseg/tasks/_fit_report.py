@@ -16,11 +16,10 @@ from splatseg.io.scene_folder import GAUSSIANS_FILE, POSES_FOLDER, scene_path
 from splatseg.lift import GaussianField
 from splatseg.pose import load_pose_report
 from splatseg.render import BackendName
-from splatseg.report.camera_map import camera_map
-from splatseg.report.fit_report import FitReportData, fit_record, fit_report, verdict_of
-from splatseg.report.fit_verdict import FitVerdict
+from splatseg.report.fit_report import FitReportData, FitVerdict, fit_record, fit_report, verdict_of
 from splatseg.report.html import report_html
 from splatseg.report.images import Gallery, GalleryImage, colour_difference
+from splatseg.report.maps import camera_map
 
 _NEXT = ("worst", "second worst", "third worst")
 

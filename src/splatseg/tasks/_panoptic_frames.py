@@ -10,7 +10,7 @@ from torch import Tensor
 from splatseg.core import UNLABELLED, Labels, Layer, RenderableLayer, RenderableView, Scene, View
 from splatseg.io.export import Category, Frame, SegmentInfo, classes_of
 from splatseg.lift import GaussianField
-from splatseg.report.legend import colour_of, names_of
+from splatseg.report.colours import colour_of, names_of
 
 _OBJECT = "object"
 _OBJECTS, _STUFF = "objects", "stuff"

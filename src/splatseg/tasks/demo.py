@@ -19,7 +19,7 @@ from splatseg.io.scene import load_scene, save_scene_layer
 from splatseg.io.scene_folder import check_unlocked, work_on_scene
 from splatseg.render import BackendName
 from splatseg.report.demo_report import DemoFigures, machine_score, write_report
-from splatseg.report.fit_verdict import scored_of
+from splatseg.report.fit_report import scored_of
 from splatseg.synthetic import cameras, room, write_capture
 from splatseg.tasks._observer import SILENT, Observer
 from splatseg.tasks.evaluate import EvaluationOptions, Metric, evaluate_scene

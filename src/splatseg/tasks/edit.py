@@ -123,9 +123,8 @@ def _edited(work: _Work, document: Document) -> tuple[Document, list[Mapping[str
         measured: dict[str, float] = {}
         added = len(ready.document.scene.gaussians) - len(document.scene.gaussians)
         if ready.split:
-            measured = measured_change(
-                document, ready.document, views=options.measure, backend=work.backend
-            )
+            if options.pictures:
+                measured = measured_change(document, ready.document, backend=work.backend)
             work.observer.info(_split_sentence(operation, ready.split, measured))
             work.observer.info(_growth_sentence(added, len(document.scene.gaussians)))
         after = apply(document, operation, prepared=ready, backend=work.backend)

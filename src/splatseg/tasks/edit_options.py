@@ -1,10 +1,9 @@
 """What is selected of a scene, and what is done with it."""
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from splatseg.core.boundary import convert_fields
+from splatseg.core.options import Natural, options
 from splatseg.errors import InputError
 
 Triple = tuple[float, float, float]
@@ -13,7 +12,12 @@ _CONDITIONS = ("layer", "box", "sphere", "opacity", "size", "colour_near", "comp
 _NOTHING_SELECTED = "expected `layer`, `box` or another condition of what is meant, got none."
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@options(
+    removed={
+        "colour_shift": "scale or set the colour, or call splatseg.edit.recolour",
+        "measure": "pictures=0 leaves out what is measured, too",
+    }
+)
 class EditOptions:
     """What is selected, and what is done with it."""
 
@@ -91,9 +95,6 @@ class EditOptions:
     colour_scale: Triple | None = None
     """Factors of red, green, blue."""
 
-    colour_shift: Triple | None = None
-    """Added to red, green, blue after that, in [-1, 1]."""
-
     flat_colour: bool = False
     """Drop what of the colour changes with the direction it is seen from."""
 
@@ -106,20 +107,16 @@ class EditOptions:
     evidence: str | None = None
     """Name of the label maps for `cut` masks. None takes those the layer was made from."""
 
-    specks: int = 30
+    specks: Natural = 30
     """With `remove` of a layer's ids: small connected pieces that touch nothing but what is
     removed go along, up to this many Gaussians each, unless they are most of another thing of
     the layer. 0 leaves them."""
 
-    pictures: int = 3
+    pictures: Natural = 3
     """Views drawn before and after, those that change most, for reports/edit.html and edit.png
-    of the new scene. 0 draws none."""
-
-    measure: int = 4
-    """Training views in which the change by the cut alone is measured. 0 skips it."""
+    of the new scene. 0 draws none, and leaves out by how much a cut alone changes renders."""
 
     def __post_init__(self) -> None:
-        convert_fields(self)
         action = self._action()
         selecting = bool(self.conditions)
         if action in ("extract", "remove", "duplicate") and not selecting:
@@ -140,10 +137,6 @@ class EditOptions:
             raise InputError(f"invert: {_NOTHING_SELECTED}")
         if self.match == "any" and len(self.conditions) < 2:
             raise InputError("match: any needs two conditions or more to choose among.")
-        if self.specks < 0 or self.pictures < 0:
-            raise InputError("specks, pictures: expected 0 or more of each.")
-        if self.measure < 0:
-            raise InputError(f"measure: expected 0 or more, got {self.measure}.")
 
     @property
     def conditions(self) -> tuple[str, ...]:
@@ -173,5 +166,4 @@ class EditOptions:
     @property
     def recolours(self) -> bool:
         """Whether something changes its colour."""
-        colours = (self.colour, self.colour_scale, self.colour_shift)
-        return self.flat_colour or any(value is not None for value in colours)
+        return self.flat_colour or self.colour is not None or self.colour_scale is not None

@@ -18,7 +18,7 @@ from splatseg.evaluate import (
     evaluate_semantic,
     matched_miou,
 )
-from splatseg.evaluate.lpips import Lpips, load_lpips
+from splatseg.evaluate.photographs import Lpips, load_lpips
 from splatseg.io.evidence import Evidence, check_map_sizes, open_evidence
 from splatseg.io.json_files import read_json
 from splatseg.io.tables import class_table

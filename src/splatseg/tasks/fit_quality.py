@@ -6,7 +6,7 @@ from splatseg.core import Scene, View
 from splatseg.evaluate import evaluate_photographs
 from splatseg.lift import GaussianField
 from splatseg.render import BackendName
-from splatseg.report.fit_verdict import MIN_PSNR
+from splatseg.report.fit_report import MIN_PSNR
 from splatseg.report.words import counted
 from splatseg.tasks.scene_parts import mask_use
 

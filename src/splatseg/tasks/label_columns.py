@@ -13,8 +13,7 @@ from splatseg.core import (
     Selection,
     layer_info_to_json,
 )
-from splatseg.report.layer_colours import layer_colours
-from splatseg.report.legend import colour_of, names_of
+from splatseg.report.colours import colour_of, layer_colours, names_of
 
 _NONE = 0
 

@@ -29,7 +29,7 @@ from splatseg.io.scene_folder import CHECKPOINT_FILE
 from splatseg.pose import PoseReport
 from splatseg.pose.pointmaps import PointmapReport
 from splatseg.render import BackendName
-from splatseg.report.fit_verdict import FitVerdict
+from splatseg.report.fit_report import FitVerdict
 from splatseg.tasks._depth_evidence import with_depth_evidence
 from splatseg.tasks._fit_moving import capture_without_moving
 from splatseg.tasks._fit_report import score_and_report

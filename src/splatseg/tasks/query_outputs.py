@@ -17,7 +17,7 @@ from splatseg.io.images import save_png
 from splatseg.lift.field_layers import selection_labels
 from splatseg.lift.label_maps import view_label_map
 from splatseg.render import BackendName, PreparedView, prepare
-from splatseg.report.selection_picture import selection_picture
+from splatseg.report.images import selection_picture
 from splatseg.tasks._film import check_film, write_film
 from splatseg.tasks._view_images import shown_image
 from splatseg.tasks.query import Answers

@@ -13,11 +13,16 @@ from splatseg.io.json_files import write_json
 from splatseg.io.scene_folder import scene_path
 from splatseg.lift import GaussianField
 from splatseg.render import BackendName, prepare
+from splatseg.report.colours import colour_of
 from splatseg.report.html import Block, Figure, Report, Table, report_html
-from splatseg.report.images import Gallery, GalleryImage, ObjectCard, ObjectGallery
-from splatseg.report.legend import colour_of
-from splatseg.report.object_gallery import sightings
-from splatseg.report.selection_picture import selection_picture
+from splatseg.report.images import (
+    Gallery,
+    GalleryImage,
+    ObjectCard,
+    ObjectGallery,
+    selection_picture,
+)
+from splatseg.report.objects import sightings
 from splatseg.report.words import counted
 from splatseg.tasks.outputs import REPORTS_FOLDER
 from splatseg.tasks.query import Answers, Found, answers_record

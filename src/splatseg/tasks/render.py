@@ -33,8 +33,7 @@ from splatseg.io.json_files import read_json, write_json
 from splatseg.io.scene import scene_layer_names
 from splatseg.lift import GaussianField
 from splatseg.render import BackendName
-from splatseg.report.layer_colours import layer_colours
-from splatseg.report.legend import colour_labels, legend_of
+from splatseg.report.colours import colour_labels, layer_colours, legend_of
 from splatseg.tasks._film import check_film, path_views, write_film, write_path
 from splatseg.tasks._observer import SILENT, Observer
 from splatseg.tasks.new_scene import check_parent_writable

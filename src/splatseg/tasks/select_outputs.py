@@ -17,7 +17,7 @@ from splatseg.lift.field_layers import selection_labels
 from splatseg.lift.label_maps import view_label_map
 from splatseg.prompting.prompts import Lasso, SelectionPrompt, ViewPrompt
 from splatseg.render import BackendName, prepare
-from splatseg.report.selection_picture import selection_picture
+from splatseg.report.images import selection_picture
 from splatseg.tasks._view_images import shown_image
 
 _SELECTED = 1

@@ -11,7 +11,7 @@ from splatseg.lift.point_network import (
     spatial_features,
 )
 from splatseg.lift.point_network.checkpoint import SHIPPED
-from splatseg.synthetic import SurfaceOptions, street, surface_points
+from splatseg_bench.worlds import SurfaceOptions, street, surface_points
 
 
 def test_it_is_small_and_says_how_it_was_made():

@@ -11,7 +11,6 @@ from splatseg import _native
 from splatseg.core import LEARNED_BYTES, Features, MaskSet, with_info
 from splatseg.core.checkpoints import Checkpoints
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.evaluate import learned_bytes
 from splatseg.io.layers import load_layer, save_layer
 from splatseg.lift.affinity import AffinityHead
 from splatseg.lift.heads import ClassifierHead
@@ -21,6 +20,7 @@ from splatseg.methods._trained_labels import TrainingContext, loss_curve
 from splatseg.methods.saga import SagaOptions, train_saga, trained_as_published
 from splatseg.methods.saga._targets import SagaTargets
 from splatseg.render import weights
+from splatseg_bench.measures import learned_bytes
 
 from .conftest import Grids, Masks
 

@@ -6,7 +6,7 @@ import torch
 
 from splatseg.pose.pointmaps import PointmapOptions
 from splatseg.pose.pointmaps._solve import solve
-from splatseg.synthetic import PointmapErrors
+from splatseg_bench.worlds import PointmapErrors
 from support.pointmaps import CameraErrors, PhotographedRoom, aligned_cameras, complete, window
 
 WRONG = PointmapErrors(outliers=0.1)

@@ -20,7 +20,7 @@ from splatseg.pose.pointmaps._start import (
     spanning_tree,
     tree_world,
 )
-from splatseg.synthetic import PointmapErrors
+from splatseg_bench.worlds import PointmapErrors
 from support.pointmaps import complete, window
 
 

@@ -10,7 +10,7 @@ from splatseg.core import Pointmap, PointmapModel
 from splatseg.errors import InputError, MissingFileError
 from splatseg.io.pointmaps import open_pointmaps
 from splatseg.pose.pointmaps import PointmapOptions, recover_from_pointmaps
-from splatseg.synthetic import PointmapErrors, SyntheticPointmaps
+from splatseg_bench.worlds import PointmapErrors, SyntheticPointmaps
 from support.pointmaps import PhotographedRoom, complete, window
 
 WRONG = PointmapErrors(noise=0.02, warp=0.03, outliers=0.1)

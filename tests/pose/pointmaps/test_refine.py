@@ -14,7 +14,7 @@ from splatseg.pose.pointmaps._residuals import Problem, Spread, seen
 from splatseg.pose.pointmaps._samples import PairSamples
 from splatseg.pose.pointmaps._solve import solve
 from splatseg.pose.pointmaps._start import rotation_of_vector
-from splatseg.synthetic import PointmapErrors
+from splatseg_bench.worlds import PointmapErrors
 from support.pointmaps import CameraErrors, PhotographedRoom, aligned_cameras, complete, window
 
 WRONG = PointmapErrors(outliers=0.1)

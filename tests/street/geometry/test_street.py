@@ -11,7 +11,8 @@ from splatseg.street.geometry import (
     mesh_depth,
 )
 from splatseg.street.primitives import voxel_primitives
-from splatseg.synthetic import SyntheticScene, cast, drive_cameras, street
+from splatseg.synthetic import SyntheticScene, cast
+from splatseg_bench.worlds import drive_cameras, street
 from support.primitives import shipped, sphere
 
 

@@ -7,7 +7,7 @@ import torch
 
 from splatseg.street.shapes import cut_patches, load_shapes, score_shapes
 from splatseg.street.shapes.checkpoint import SHIPPED
-from splatseg.synthetic import street, surface_points, varied_room
+from splatseg_bench.worlds import street, surface_points, varied_room
 
 
 def test_it_loads_first_of_all_and_is_frozen() -> None:

@@ -7,7 +7,7 @@ from PIL import Image
 from scipy import ndimage
 
 from splatseg.core import View
-from splatseg.io.benchmarks.spin_nerf import WORDS_FILE
+from splatseg_bench.layouts.spin_nerf import WORDS_FILE
 from support.benchmark_layouts.source import Mask, Source, Thing, link, save_mask
 from support.benchmark_layouts.sparse import write_sparse
 

@@ -14,7 +14,7 @@ from PIL import Image
 from splatseg.core import Camera, ClassInfo, ClassTable, LayerInfo, RenderableLayer, Scene, View
 from splatseg.errors import InputError
 from splatseg.io.scans import read_scans
-from splatseg.report.point_map import LabelledPoints
+from splatseg.report.maps import LabelledPoints
 from splatseg.street.field import MeshField
 from splatseg.street.geometry import DepthView
 from splatseg.street.options import DnmpOptions

@@ -16,8 +16,7 @@ from splatseg.core import (
     map_ids,
 )
 from splatseg.core.boundary import boundary
-from splatseg.evaluate import Confusion, semantic_score
-from splatseg.evaluate.protocols import street_class
+from splatseg.evaluate import Confusion, semantic_score, street_class
 from splatseg.io.depths import depth_kind
 from splatseg.lift.points import points_in_sight
 from splatseg.report.street_report import PointScore

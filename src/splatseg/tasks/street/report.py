@@ -15,11 +15,10 @@ from splatseg.io.atomic import atomic_file
 from splatseg.io.images import image_camera, load_image
 from splatseg.io.json_files import write_json
 from splatseg.io.scene_folder import scene_path, work_on_scene
+from splatseg.report.colours import colour_labels, layer_colours
 from splatseg.report.html import Notice, report_html
 from splatseg.report.images import Gallery, GalleryImage, colour_depth
-from splatseg.report.layer_colours import layer_colours
-from splatseg.report.legend import colour_labels
-from splatseg.report.point_map import LabelledPoints, point_map
+from splatseg.report.maps import LabelledPoints, point_map
 from splatseg.report.street_report import (
     LevelFacts,
     PointCounts,

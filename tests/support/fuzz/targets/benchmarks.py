@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from splatseg.io.benchmarks.lerf_ovs import filled, read_label, read_lerf_ovs
-from splatseg.io.benchmarks.replica import read_replica_scenes
-from splatseg.io.benchmarks.scannet import read_labelled_points, read_nyu40_ids
-from splatseg.io.benchmarks.scannetpp import read_annotated_points
 from splatseg.io.captures import read_capture
+from splatseg_bench.layouts.lerf_ovs import filled, read_label, read_lerf_ovs
+from splatseg_bench.layouts.replica import read_replica_scenes
+from splatseg_bench.layouts.scannet import read_labelled_points, read_nyu40_ids
+from splatseg_bench.layouts.scannetpp import read_annotated_points
 from support.benchmark_layouts.rooms import write_ply
 from support.fuzz.targets.base import HEIGHT, WIDTH, Target, photographs, target, whole
 

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from splatseg.io.benchmarks import read_benchmark
 from splatseg.io.captures import read_capture
 from splatseg.io.moving import read_moving
 from splatseg.io.scans import read_scans
+from splatseg_bench.layouts import read_benchmark
 from support.benchmark_layouts.kitti360 import write_window
 from support.fuzz.targets.base import Target, target
 from support.kitti import (

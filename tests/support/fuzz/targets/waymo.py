@@ -5,10 +5,10 @@ import struct
 from pathlib import Path
 
 from splatseg.errors import FileFormatError, InputError
-from splatseg.io.benchmarks.waymo import read_waymo_scenes
 from splatseg.io.captures import read_capture
 from splatseg.io.moving import read_moving
 from splatseg.io.scans import read_scans
+from splatseg_bench.layouts.waymo import read_waymo_scenes
 from support.fuzz.targets.base import Target, target
 from support.waymo_files import CONTEXT, SCHEMAS, tiny_rows, write_segment
 from support.waymo_tfrecord import framed, frames_of, write_tfrecord

@@ -1,0 +1,33 @@
+"""Protocols of published benchmarks as data: what is asked, every choice, the published figures."""
+
+from splatseg_bench.protocols._catalogue import CANONICAL_NEGATIVES as CANONICAL_NEGATIVES
+from splatseg_bench.protocols._catalogue import PROTOCOLS as PROTOCOLS
+from splatseg_bench.protocols._catalogue import SCENE_LISTS as SCENE_LISTS
+from splatseg_bench.protocols._catalogue import SKY as SKY
+from splatseg_bench.protocols._catalogue import TABLE_1 as TABLE_1
+from splatseg_bench.protocols._catalogue import find_protocol as find_protocol
+from splatseg_bench.protocols._catalogue import merged_name as merged_name
+from splatseg_bench.protocols._protocol import ALL_WINDOWS as ALL_WINDOWS
+from splatseg_bench.protocols._protocol import MapSwitches as MapSwitches
+from splatseg_bench.protocols._protocol import PointSwitches as PointSwitches
+from splatseg_bench.protocols._protocol import Protocol as Protocol
+from splatseg_bench.protocols._protocol import PublishedFigure as PublishedFigure
+from splatseg_bench.protocols._protocol import RoomSwitches as RoomSwitches
+from splatseg_bench.protocols._protocol import SceneList as SceneList
+from splatseg_bench.protocols._protocol import SpokenSwitches as SpokenSwitches
+from splatseg_bench.protocols._protocol import StreetSwitches as StreetSwitches
+from splatseg_bench.protocols._protocol import Switches as Switches
+from splatseg_bench.protocols._protocol import TargetSwitches as TargetSwitches
+from splatseg_bench.protocols._protocol import differences as differences
+from splatseg_bench.protocols._protocol import recorded as recorded
+from splatseg_bench.protocols._protocol import switch_value as switch_value
+from splatseg_bench.protocols._scoring import MaskRow as MaskRow
+from splatseg_bench.protocols._scoring import box_filtered as box_filtered
+from splatseg_bench.protocols._scoring import mask_scores as mask_scores
+from splatseg_bench.protocols._scoring import peak_in_boxes as peak_in_boxes
+from splatseg_bench.protocols._scoring import relevancy_mask as relevancy_mask
+from splatseg_bench.protocols._scoring import resized_mask as resized_mask
+from splatseg_bench.protocols._scoring import score_mask as score_mask
+from splatseg_bench.protocols._scoring import smoothed_relevancy as smoothed_relevancy
+from splatseg_bench.protocols._scoring import stretched as stretched
+from splatseg_bench.protocols.published import published_figures as published_figures
