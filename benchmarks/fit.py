@@ -19,7 +19,7 @@ from pathlib import Path
 
 from splatseg.core import Capture
 from splatseg.evaluate import evaluate_photographs
-from splatseg.fit import FitOptions, _loop, _run, _step
+from splatseg.fit import FitOptions, _run, _step
 from splatseg.fit._photographs import Photographs
 from splatseg.io.captures import read_capture
 from splatseg.lift import GaussianField
@@ -74,7 +74,7 @@ def main() -> None:
     marks = sorted({*arguments.marks, arguments.minutes})
     run = _run.FitRun(capture, options, get_backend("cpu"), photographs)
     before, steps, last = dict(run.stages), 0, (0, 0.0)
-    with _loop.one_torch_thread():
+    with _run.one_torch_thread():
         for mark in marks:
             while not run.finished and run.seconds < 60 * mark:
                 status = run.step()

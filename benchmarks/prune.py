@@ -14,7 +14,7 @@ from pathlib import Path
 from splatseg.core import Gaussians, View
 from splatseg.evaluate import evaluate_photographs
 from splatseg.fit._photographs import Photographs
-from splatseg.fit._prune import without_floaters
+from splatseg.fit._refine import without_floaters
 from splatseg.io.images import DEFAULT_LONGEST
 from splatseg.io.scene import load_scene
 from splatseg.lift import GaussianField

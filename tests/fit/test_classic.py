@@ -1,19 +1,17 @@
 """Classic densification: each rule on a scene of a few Gaussians."""
 
 import math
-from dataclasses import replace
 
 import pytest
 import torch
 
 from splatseg.core import Camera
 from splatseg.fit import FitOptions
-from splatseg.fit._classic import ScreenStatistics, densified, with_reset_opacities
-from splatseg.fit._density import Classic
+from splatseg.fit._density import DefaultStrategy, ScreenStatistics, densified, with_reset_opacities
 from splatseg.fit._parameters import Parameters
 
 EXTENT = 10.0
-OPTIONS = FitOptions(strategy="classic", densify_gradient=0.1, clone_scale=0.01)
+OPTIONS = FitOptions(strategy="classic", densify_gradient=0.1)
 """Cloned up to a scale of 0.1, split above; dropped above a scale of 1."""
 
 
@@ -126,32 +124,6 @@ def test_large_ones_are_dropped_after_the_first_reset_only():
     assert torch.equal(grown.means, start.means[[1, 3]])
 
 
-def test_how_large_is_too_large_is_asked_for():
-    """In scene extents, of 10, and in pixels."""
-    start = _parameters([0.61, 0.59, 0.1, 0.1])
-    statistics = _statistics([0.0] * 4, radii=[0.0, 0.0, 5.1, 4.9])
-
-    def kept(**changes):
-        options = replace(OPTIONS, **changes)
-        grown, _, _ = _round(start, statistics, prune_large=True, options=options)
-        return [int(row) for row in (grown.means[:, None] == start.means).all(-1).nonzero()[:, 1]]
-
-    assert kept() == [0, 1, 2, 3]
-    assert kept(prune_scale=0.06) == [1, 2, 3]
-    assert kept(prune_radius=5.0) == [0, 1, 3]
-
-
-def test_how_low_a_reset_goes_is_asked_for():
-    options = FitOptions(strategy="classic", steps=100, minutes=None, reset_opacity=0.2)
-    options = replace(options, reset_every=15)
-    classic = Classic(options, start=2, extent=EXTENT, device=torch.device("cpu"))
-    start = _parameters([0.1, 0.1], opacities=[0.1, 0.9])
-    found, _, _ = classic.after_step(
-        (start, *_moments(start)), steps=15, progress=0.14, generator=torch.Generator()
-    )
-    assert found.logits.sigmoid().squeeze(1).tolist() == pytest.approx([0.1, 0.2])
-
-
 def test_a_scene_is_never_emptied():
     start = _parameters([0.1, 0.1], opacities=[0.001, 0.001])
     assert len(_round(start, _statistics([0.0, 0.0]))[0]) == 2
@@ -159,7 +131,7 @@ def test_a_scene_is_never_emptied():
 
 def test_a_reset_lowers_opacities_and_forgets_their_moments():
     start = _parameters([0.1, 0.1], opacities=[0.008, 0.9])
-    reset, first, second = with_reset_opacities(start, *_moments(start), max_opacity=0.01)
+    reset, first, second = with_reset_opacities(start, *_moments(start))
     assert reset.logits.sigmoid().squeeze(1).tolist() == pytest.approx([0.008, 0.01])
     assert start.logits.sigmoid()[1] == pytest.approx(0.9)
     for moment in (first, second):
@@ -199,7 +171,7 @@ def test_when_rounds_and_resets_come():
     generator = torch.Generator().manual_seed(0)
 
     def after(steps):
-        classic = Classic(options, start=2, extent=EXTENT, device=torch.device("cpu"))
+        classic = DefaultStrategy(options, start=2, extent=EXTENT, device=torch.device("cpu"))
         start = _parameters([0.1, 0.1], opacities=[0.001, 0.9])
         state = (start, *_moments(start))
         found, _, _ = classic.after_step(
@@ -219,7 +191,7 @@ def test_when_rounds_and_resets_come():
 
 def test_statistics_go_on_after_a_restore():
     options = FitOptions(strategy="classic", steps=100, minutes=None, reset_every=41)
-    one = Classic(options, start=2, extent=EXTENT, device=torch.device("cpu"))
+    one = DefaultStrategy(options, start=2, extent=EXTENT, device=torch.device("cpu"))
     start = _parameters([0.1, 0.1])
     state = one.after_step(
         (start, *_moments(start)), steps=41, progress=0.4, generator=torch.Generator()
@@ -228,7 +200,7 @@ def test_statistics_go_on_after_a_restore():
         width=2, height=2, fx=1.0, fy=1.0, cx=1, cy=1, cam_from_world=torch.eye(4).double()
     )
     one.add_view(torch.tensor([1]), torch.ones(1, 2), camera=camera, parameters=state[0])
-    other = Classic(options, start=2, extent=EXTENT, device=torch.device("cpu"))
+    other = DefaultStrategy(options, start=2, extent=EXTENT, device=torch.device("cpu"))
     other.restore(one.state())
     assert other.state().keys() == {"gradients", "views", "radii", "resets"}
     for name, tensor in one.state().items():

@@ -3,8 +3,7 @@
 import pytest
 import torch
 
-from splatseg.fit import FitOptions
-from splatseg.fit._densify import relocated, shared_shape
+from splatseg.fit._density import relocated, shared_shape
 from splatseg.fit._parameters import Parameters
 
 
@@ -32,7 +31,6 @@ def _relocated(
         _ones(parameters),
         _ones(parameters),
         count=count,
-        options=FitOptions(),
         generator=torch.Generator().manual_seed(seed),
     )
 

@@ -11,7 +11,7 @@ from PIL import Image
 from splatseg.core import Camera, DepthMap, PointCloud, View
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.fit import FitOptions, fit
-from splatseg.fit._depth import DepthMaps, aligned_inverse
+from splatseg.fit.depth import DepthMaps, aligned_inverse
 from splatseg.io.depths import load_depth
 from splatseg.io.evidence import save_depth_map
 from splatseg.render import render

@@ -7,11 +7,16 @@ import pytest
 import torch
 
 from splatseg.evaluate import evaluate_photographs
-from splatseg.fit import FitOptions, fit
-from splatseg.fit._exposure import Exposures
+from splatseg.fit import FitOptions, _views, fit
+from splatseg.fit._views import Exposures
 from splatseg.lift import GaussianField
 
-OPTIONS = FitOptions(minutes=None, steps=1, exposure=True, exposure_rate=0.1, exposure_prior=0.0)
+
+@pytest.fixture(autouse=True)
+def fast(monkeypatch) -> None:
+    """A tenth a step, and no prior."""
+    monkeypatch.setattr(_views, "_EXPOSURE_RATE", 0.1)
+    monkeypatch.setattr(_views, "_EXPOSURE_PRIOR", 0.0)
 
 
 def _one_step(exposures: Exposures, index: int, gradient: torch.Tensor) -> None:
@@ -24,12 +29,12 @@ def _one_step(exposures: Exposures, index: int, gradient: torch.Tensor) -> None:
 
 def test_nothing_is_changed_at_the_start() -> None:
     image, alpha = torch.rand(4, 5, 3), torch.rand(4, 5)
-    assert torch.equal(Exposures(3, options=OPTIONS).applied(1, image, alpha), image)
+    assert torch.equal(Exposures(3).applied(1, image, alpha), image)
 
 
 def test_a_step_by_hand() -> None:
     """Adam's first step is the rate times the sign; what one view gains, all give up a third."""
-    exposures = Exposures(3, options=OPTIONS)
+    exposures = Exposures(3)
     gradient = torch.zeros(2, 3, 3)
     gradient[..., 0], gradient[..., 1] = 1.0, -1.0
     _one_step(exposures, 1, gradient)
@@ -48,7 +53,7 @@ def test_a_step_by_hand() -> None:
 
 
 def test_gradients_reach_picture_alpha_and_exposure() -> None:
-    exposures = Exposures(2, options=OPTIONS)
+    exposures = Exposures(2)
     _one_step(exposures, 0, torch.rand(2, 3, 3))
     gain, bias = exposures.gains[0], exposures.biases[0]
     image = torch.rand(2, 3, 3, dtype=torch.float64).requires_grad_()
@@ -63,17 +68,16 @@ def test_gradients_reach_picture_alpha_and_exposure() -> None:
 
 
 def test_a_single_view_has_no_exposure_of_its_own() -> None:
-    exposures = Exposures(1, options=OPTIONS)
+    exposures = Exposures(1)
     _one_step(exposures, 0, torch.ones(2, 3, 3))
     assert torch.equal(exposures.gains, torch.ones(1, 3).double())
 
 
-def test_the_prior_pulls_back() -> None:
+def test_the_prior_pulls_back(monkeypatch) -> None:
     """Where the image has no gradient, the exposure decays to the identity."""
-    options = FitOptions(
-        minutes=None, steps=1, exposure=True, exposure_rate=0.01, exposure_prior=1.0
-    )
-    exposures = Exposures(2, options=options)
+    monkeypatch.setattr(_views, "_EXPOSURE_RATE", 0.01)
+    monkeypatch.setattr(_views, "_EXPOSURE_PRIOR", 1.0)
+    exposures = Exposures(2)
     exposures._values = torch.tensor([[0.2] * 6, [-0.2] * 6]).double()
     for _ in range(30):
         for index in (0, 1):
@@ -83,7 +87,7 @@ def test_the_prior_pulls_back() -> None:
 
 def test_a_restored_one_goes_on_as_if_nothing_had_been(rng) -> None:
     gradients = [torch.from_numpy(rng.normal(size=(2, 3, 3))).float() for _ in range(6)]
-    one, other = Exposures(3, options=OPTIONS), Exposures(3, options=OPTIONS)
+    one, other = Exposures(3), Exposures(3)
     for i, gradient in enumerate(gradients[:3]):
         _one_step(one, i, gradient)
     other.restore({name: tensor.clone() for name, tensor in one.state().items()})
@@ -94,8 +98,9 @@ def test_a_restored_one_goes_on_as_if_nothing_had_been(rng) -> None:
     assert torch.equal(one.biases, other.biases)
 
 
-def test_unequally_bright_photographs(photograph) -> None:
+def test_unequally_bright_photographs(photograph, monkeypatch) -> None:
     """Every second photograph is half as bright again as the others; test views are in between."""
+    monkeypatch.undo()
     gains = [1.25 if i % 2 else 0.8 for i in range(14)]
     capture = photograph(gains=[1.0 if i % 5 == 2 else g for i, g in enumerate(gains)])
     options = FitOptions(minutes=None, steps=700, max_gaussians=200, background="black")

@@ -14,6 +14,7 @@ from splatseg.core.sh import SH_C0
 from splatseg.errors import InputError, MissingFileError
 from splatseg.evaluate import evaluate_photographs
 from splatseg.fit import FitOptions, FitProgress, FitResult, fit
+from splatseg.fit._options import COLOUR_RATE
 from splatseg.lift import GaussianField
 from splatseg.render import render
 
@@ -61,8 +62,9 @@ def test_photographs_with_a_lens_are_matched_in_their_own_pixels(make_capture) -
     assert _held_out(fit(capture, options=OPTIONS), capture) > 26
 
 
-def test_the_reference_backend_takes_the_same_steps(capture: Capture) -> None:
-    options = replace(OPTIONS, steps=3, quarter_until=0.0, half_until=0.0)
+def test_the_reference_backend_takes_the_same_steps(capture: Capture, with_rates) -> None:
+    with_rates(quarter_until=0.0, half_until=0.0)
+    options = replace(OPTIONS, steps=3)
     fast, slow = (fit(capture, options=options, backend=name) for name in ("cpu", "reference"))
     for name in ("means", "scales", "opacities", "sh"):
         torch.testing.assert_close(
@@ -184,26 +186,30 @@ def test_penalties_make_gaussians_faint_and_small(capture: Capture) -> None:
     assert float(small.scales.mean()) < 0.9 * float(free.scales.mean())
 
 
-def test_harmonics_wait_for_their_turn(capture: Capture) -> None:
-    options = replace(OPTIONS, steps=30, sh_degree=2, sh_degree_interval=0.5)
+def test_harmonics_wait_for_their_turn(capture: Capture, with_rates) -> None:
+    with_rates(sh_degree_interval=0.5)
+    options = replace(OPTIONS, steps=30, sh_degree=2)
     sh = fit(capture, options=options).gaussians.sh
     assert bool(sh[:, 1:4].any())
     assert not bool(sh[:, 4:].any())
 
 
-def test_coarse_photographs_teach_the_same_scene(make_capture) -> None:
+def test_coarse_photographs_teach_the_same_scene(make_capture, with_rates) -> None:
     """Fitted at a quarter of the size all along, the full-size views look right too."""
     capture = make_capture(width=260, height=256, fx=260.0, fy=260.0)
     options = replace(OPTIONS, steps=120, noise=0.0)
-    coarse = fit(capture, options=replace(options, quarter_until=1.0))
+    with_rates(quarter_until=1.0)
+    coarse = fit(capture, options=options)
     assert _held_out(coarse, capture) > 21
-    fine = fit(capture, options=replace(options, steps=1, quarter_until=0.0, half_until=0.0))
-    quick = fit(capture, options=replace(options, steps=1, quarter_until=1.0))
+    quick = fit(capture, options=replace(options, steps=1))
+    with_rates(quarter_until=0.0, half_until=0.0)
+    fine = fit(capture, options=replace(options, steps=1))
     assert not _same(fine.gaussians, quick.gaussians)
 
 
-def test_noise_is_part_of_the_fit(capture: Capture) -> None:
-    options = replace(OPTIONS, steps=10, start_opacity=0.02)
+def test_noise_is_part_of_the_fit(capture: Capture, monkeypatch) -> None:
+    monkeypatch.setattr("splatseg.fit._start.START_OPACITY", 0.02)
+    options = replace(OPTIONS, steps=10)
     quiet = fit(capture, options=replace(options, noise=0.0)).gaussians
     assert not torch.equal(quiet.means, fit(capture, options=options).gaussians.means)
 
@@ -215,12 +221,12 @@ def test_the_first_step_is_the_rate(capture: Capture) -> None:
     grey = PointCloud(
         points=capture.points.points, colours=torch.full((60, 3), 128, dtype=torch.uint8)
     )
-    options = replace(OPTIONS, steps=1, colour_rate=0.25)
+    options = replace(OPTIONS, steps=1)
     found = fit(replace(capture, points=grey), options=options).gaussians
     moved = (found.sh[:, 0] - colours).abs()
     assert float(moved.max()) > 0
     still = moved < 1e-6
-    torch.testing.assert_close(moved[~still], torch.full_like(moved[~still], 0.25))
+    torch.testing.assert_close(moved[~still], torch.full_like(moved[~still], COLOUR_RATE))
 
 
 def test_both_parts_of_the_loss_are_used(capture: Capture) -> None:
@@ -294,7 +300,7 @@ def test_photographs_with_alpha_are_blended_over_the_background(
     assert float(covered) < 0.9 * float(render(over_white.gaussians, camera).alpha.mean())
 
 
-def test_millimetres_are_as_good_as_kilometres(capture: Capture) -> None:
+def test_millimetres_are_as_good_as_kilometres(capture: Capture, monkeypatch) -> None:
     """The same scene in other units takes the same steps: walk and penalties scale with it."""
 
     def scaled(by: float) -> Capture:
@@ -307,7 +313,8 @@ def test_millimetres_are_as_good_as_kilometres(capture: Capture) -> None:
         points = replace(capture.points, points=capture.points.points * by)
         return replace(capture, views=tuple(views), points=points)
 
-    options = replace(OPTIONS, steps=60, scale_penalty=1.0, noise=1e5, start_opacity=0.03)
+    monkeypatch.setattr("splatseg.fit._start.START_OPACITY", 0.03)
+    options = replace(OPTIONS, steps=60, scale_penalty=1.0, noise=1e5)
     one = fit(capture, options=options).gaussians
     for by in (1024.0, 1 / 8):
         other = fit(scaled(by), options=options).gaussians

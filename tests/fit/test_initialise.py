@@ -7,7 +7,7 @@ import torch
 
 from splatseg.core import Camera, Capture, PointCloud, View
 from splatseg.fit import FitOptions
-from splatseg.fit._initialise import initial_parameters, scene_extent
+from splatseg.fit._start import initial_parameters, scene_extent
 
 
 def _view(x: float, y: float, z: float) -> View:

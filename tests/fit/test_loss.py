@@ -7,7 +7,7 @@ from torch import Tensor
 
 from splatseg import _native
 from splatseg.errors import RangeError, ShapeError
-from splatseg.fit._loss import l1_dssim, l1_dssim_torch
+from splatseg.fit._step import l1_dssim, l1_dssim_torch
 
 
 def _pair(rng: np.random.Generator, height: int, width: int) -> tuple[Tensor, Tensor]:

@@ -9,8 +9,8 @@ import torch
 
 from splatseg.core import Camera, Similarity
 from splatseg.evaluate import evaluate_photographs
-from splatseg.fit import FitOptions, fit
-from splatseg.fit._poses import (
+from splatseg.fit import FitOptions, _views, fit
+from splatseg.fit._views import (
     Poses,
     aligning_similarity,
     centres_of,
@@ -20,7 +20,11 @@ from splatseg.fit._poses import (
 )
 from splatseg.lift import GaussianField
 
-OPTIONS = FitOptions(minutes=None, steps=1, refine_poses=True, pose_rate=0.5)
+
+@pytest.fixture(autouse=True)
+def fast(monkeypatch) -> None:
+    """Half a pixel a step."""
+    monkeypatch.setattr(_views, "_POSE_RATE", 0.5)
 
 
 def _pose(rng: np.random.Generator) -> torch.Tensor:
@@ -83,7 +87,7 @@ def test_a_step_goes_down_the_slope_by_the_rate(rng: np.random.Generator) -> Non
         torch.from_numpy(rng.uniform(1, 47, (200, 2))), torch.from_numpy(rng.uniform(2, 4, 200))
     )
     for scale in (1e-6, 1.0, 1e6):
-        poses = Poses([camera], points=points, options=OPTIONS)
+        poses = Poses([camera], points=points)
         leaf = poses.leaf(0, camera)
         goal = torch.from_numpy(np.random.default_rng(0).normal(size=(4, 4)))
         (scale * (leaf.cam_from_world * goal)[:3].sum()).backward()
@@ -106,7 +110,7 @@ def test_alignment_takes_a_common_motion_out(rng: np.random.Generator) -> None:
     )
     back = aligning_similarity(given, refined)
     assert torch.allclose(back.matrix, refined_from_given.inverse().matrix, atol=1e-9)
-    poses = Poses([_camera(pose) for pose in given], points=torch.zeros(0, 3), options=OPTIONS)
+    poses = Poses([_camera(pose) for pose in given], points=torch.zeros(0, 3))
     poses.restore({**poses.state(), "poses": refined})
     assert torch.allclose(poses.aligned()[1], given, atol=1e-9)
     assert poses.shift().degrees_max < 1e-6
@@ -136,7 +140,7 @@ def test_the_shift_by_hand() -> None:
     angle = math.radians(2)
     turned = exponential(torch.tensor([0, angle, 0, 0, 0, 0], dtype=torch.float64)) @ far
     turned[:3, 3] = -turned[:3, :3] @ centres_of(far[None])[0]
-    poses = Poses([_camera(eye), _camera(far)], points=torch.zeros(0, 3), options=OPTIONS)
+    poses = Poses([_camera(eye), _camera(far)], points=torch.zeros(0, 3))
     poses.restore({**poses.state(), "poses": torch.stack((eye, turned))})
     shift = poses.shift()
     assert shift.degrees_max == pytest.approx(4 / 3, rel=1e-3)
@@ -146,7 +150,7 @@ def test_the_shift_by_hand() -> None:
 def test_a_restored_one_goes_on_as_if_nothing_had_been(rng: np.random.Generator) -> None:
     cameras = [_camera(_pose(rng)) for _ in range(2)]
     points = torch.from_numpy(rng.normal(size=(50, 3)) + np.array([0.0, 0.0, 3.0]))
-    one, other = (Poses(cameras, points=points, options=OPTIONS) for _ in range(2))
+    one, other = (Poses(cameras, points=points) for _ in range(2))
     gradients = torch.from_numpy(rng.normal(size=(4, 4, 4)))
 
     def step(poses: Poses, i: int) -> None:
@@ -162,7 +166,9 @@ def test_a_restored_one_goes_on_as_if_nothing_had_been(rng: np.random.Generator)
     assert torch.equal(one.state()["poses"], other.state()["poses"])
 
 
-def test_wrong_poses_are_found_again(photograph, rng: np.random.Generator) -> None:
+def test_wrong_poses_are_found_again(
+    photograph, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Poses off by half a degree and 1 % of the distance: the fit moves them most of the way."""
     capture = photograph(count=15, arc=1.2, noise=0.02, width=128, height=112, fx=160.0, fy=160.0)
     wrong = []
@@ -176,6 +182,7 @@ def test_wrong_poses_are_found_again(photograph, rng: np.random.Generator) -> No
         camera = replace(view.camera, cam_from_world=pose) if train else view.camera
         wrong.append(replace(view, camera=camera))
     started = replace(capture, views=tuple(wrong))
+    monkeypatch.undo()
     options = FitOptions(minutes=None, steps=700, max_gaussians=150, background="black")
     plain = fit(started, options=options)
     refined = fit(started, options=replace(options, refine_poses=True))

@@ -8,7 +8,7 @@ import torch
 from splatseg.core import Camera, Capture, Gaussians
 from splatseg.evaluate import evaluate_photographs
 from splatseg.fit import FitOptions, fit
-from splatseg.fit._prune import MaskedView, needed, reduction_for
+from splatseg.fit._refine import MaskedView, needed, reduction_for
 from splatseg.lift import GaussianField
 
 

@@ -9,6 +9,7 @@ from splatseg.core import Gaussians
 from splatseg.errors import InputError, RangeError, SplatsegError
 from splatseg.evaluate import psnr, render_and_photograph
 from splatseg.fit import FitOptions, Refinement, refine
+from splatseg.fit._options import COLOUR_RATE, RATES
 from splatseg.lift import GaussianField
 from splatseg.render.cpu import set_threads, threads
 
@@ -129,8 +130,8 @@ def test_rates_fall_from_those_of_the_start_to_those_of_the_end(make_capture, ti
         found = refine(worse(tiny), views, steps=1, start=start, options=QUICK, backend="cpu")
         return float((found.sh[:, 0] - worse(tiny).sh[:, 0]).abs().max())
 
-    assert moved(0.0) == pytest.approx(QUICK.colour_rate, rel=0.02)
-    assert moved(1.0) == pytest.approx(QUICK.colour_rate * QUICK.final_rate, rel=0.02)
+    assert moved(0.0) == pytest.approx(COLOUR_RATE, rel=0.02)
+    assert moved(1.0) == pytest.approx(COLOUR_RATE * RATES["fast"].final, rel=0.02)
 
 
 def test_every_step_has_the_rates_of_its_progress(make_capture, tiny, monkeypatch) -> None:

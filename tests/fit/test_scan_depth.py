@@ -1,15 +1,15 @@
 """Depth maps of scans: what hides what, by hand and on a plane."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import pytest
 import torch
 
 from splatseg.core import Camera, Scan
-from splatseg.errors import RangeError, ShapeError
-from splatseg.fit import DepthPoints, ScanDepthOptions, scan_depths
-from splatseg.fit.scan_depth import unhidden
+from splatseg.errors import ShapeError
+from splatseg.fit import DepthPoints, scan_depths
+from splatseg.fit.depth import unhidden
 
 INF = torch.inf
 
@@ -75,22 +75,26 @@ def test_a_slanted_surface_hides_nothing_of_itself() -> None:
     assert torch.equal(found, depth)
 
 
-def test_options_count_in_metres() -> None:
+def test_spacing_and_tolerances_are_metres(monkeypatch: pytest.MonkeyPatch) -> None:
     points = [[[0, 0, 2.0], [1.0, 0, 5.0]]]
     assert maps(points)[0][3, 6] == 5
-    wide = ScanDepthOptions(spacing=0.4)
-    assert maps(points, options=wide)[0][3, 6] == 0
-    assert maps(points, options=wide, metres_per_unit=10.0)[0][3, 6] == 5
-    for words in ({"tolerance": 3.0}, {"relative_tolerance": 1.6}):
-        assert maps(points, options=replace(wide, **words))[0][3, 6] == 5
+    assert maps(points, spacing=0.4)[0][3, 6] == 0
+    assert maps(points, spacing=0.4, metres_per_unit=10.0)[0][3, 6] == 5
+    for name, value in (("_TOLERANCE", 3.0), ("_RELATIVE_TOLERANCE", 1.6)):
+        with monkeypatch.context() as changed:
+            changed.setattr(f"splatseg.fit.depth.{name}", value)
+            assert maps(points, spacing=0.4)[0][3, 6] == 5
 
 
-def test_views_at_a_time_change_nothing_but_how_often_scans_are_read() -> None:
+def test_views_at_a_time_change_nothing_but_how_often_scans_are_read(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     points = {f"{i}": torch.rand(50, 3, generator=torch.manual_seed(i)) * 4 for i in range(2)}
     cameras = [camera(x) for x in (0.0, 0.5, 1.0)]
     one, two = Scans(points), Scans(points)
     whole = list(scan_depths(one, cameras))
-    parts = list(scan_depths(two, cameras, options=ScanDepthOptions(views=2)))
+    monkeypatch.setattr("splatseg.fit.depth._VIEWS", 2)
+    parts = list(scan_depths(two, cameras))
     assert all(torch.equal(a, b) for a, b in zip(whole, parts, strict=True))
     assert (len(one.asked), len(two.asked)) == (2, 4)
 
@@ -111,12 +115,3 @@ def test_points_of_depths_are_where_they_were_measured_with_their_colour() -> No
     assert cloud.colours.tolist() == [[0, 0, 0], [200, 200, 200]]
     with pytest.raises(ShapeError, match="image"):
         points.add(views[0], torch.ones(7, 9), image[:3])
-
-
-def test_bad_options_are_refused() -> None:
-    for name in ("spacing", "start_cell", "views"):
-        with pytest.raises(RangeError, match=f"{name}: expected a positive number"):
-            ScanDepthOptions(**{name: 0})
-    for name in ("tolerance", "relative_tolerance"):
-        with pytest.raises(RangeError, match=f"{name}: expected 0 or more"):
-            ScanDepthOptions(**{name: -1.0})

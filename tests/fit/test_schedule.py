@@ -4,51 +4,41 @@ import pytest
 
 from splatseg.errors import InputError, RangeError
 from splatseg.fit import FitOptions
-from splatseg.fit._schedule import count_at, degree_at, rates_at, reduction_at
+from splatseg.fit._parameters import count_at, degree_at, rates_at, reduction_at
 
-OPTIONS = FitOptions(
-    position_rate=1e-2,
-    position_rate_end=1e-4,
-    scale_rate=0.5,
-    rotation_rate=0.3,
-    opacity_rate=0.7,
-    colour_rate=0.2,
-    final_rate=0.25,
-    quarter_until=0.1,
-    half_until=0.3,
-    sh_degree_interval=0.2,
-    sh_degree=2,
-    max_gaussians=1000,
-    grow_until=0.5,
+OPTIONS = FitOptions(sh_degree=2, max_gaussians=1000)
+
+
+@pytest.mark.parametrize(
+    ("rates", "means", "scales", "final"),
+    [("fast", (8e-4, 8e-6), 1e-2, 0.2), ("published", (1.6e-4, 1.6e-6), 5e-3, 1.0)],
 )
-
-
-def test_rates_fall_exponentially() -> None:
-    begin, halfway, end = (rates_at(p, options=OPTIONS, extent=3.0) for p in (0.0, 0.5, 1.0))
-    assert begin.means == pytest.approx(3e-2)
-    assert halfway.means == pytest.approx(3e-3)
-    assert end.means == pytest.approx(3e-4)
+def test_rates_fall_exponentially(rates, means, scales, final) -> None:
+    options = FitOptions(rates=rates)
+    begin, halfway, end = (rates_at(p, options=options, extent=3.0) for p in (0.0, 0.5, 1.0))
+    assert (begin.means, end.means) == pytest.approx((3 * means[0], 3 * means[1]))
+    assert halfway.means == pytest.approx(3 * (means[0] * means[1]) ** 0.5)
     assert (begin.log_scales, halfway.log_scales, end.log_scales) == pytest.approx(
-        (0.5, 0.25, 0.125)
+        (scales, scales * final**0.5, scales * final)
     )
-    assert begin.colour == pytest.approx(20 * begin.sh_rest)
-    assert end.colour == pytest.approx(0.05)
-    assert (begin.logits, end.logits) == pytest.approx((0.7, 0.25 * 0.7))
-    assert (begin.rotations, end.rotations) == pytest.approx((0.3, 0.25 * 0.3))
+    assert (begin.colour, begin.sh_rest) == pytest.approx((2.5e-3, 1.25e-4))
+    assert (end.colour, end.logits, end.rotations) == pytest.approx(
+        (2.5e-3 * final, 5e-2 * final, 1e-3 * final)
+    )
 
 
 def test_photographs_grow_to_full_size() -> None:
     def at(progress: float, width: int = 800, height: int = 600) -> int:
         return reduction_at(progress, options=OPTIONS, width=width, height=height)
 
-    assert [at(p) for p in (0.0, 0.0999, 0.1, 0.2999, 0.3, 1.0)] == [4, 4, 2, 2, 1, 1]
+    assert [at(p) for p in (0.0, 0.0199, 0.02, 0.0699, 0.07, 1.0)] == [4, 4, 2, 2, 1, 1]
     assert at(0.0, 256, 2000) == 4
     assert at(0.0, 255, 2000) == 2
     assert at(0.0, 2000, 127) == 1
 
 
 def test_degrees_come_one_by_one() -> None:
-    degrees = [degree_at(p, options=OPTIONS) for p in (0.0, 0.19, 0.21, 0.39, 0.41, 1.0)]
+    degrees = [degree_at(p, options=OPTIONS) for p in (0.0, 0.09, 0.11, 0.19, 0.21, 1.0)]
     assert degrees == [0, 0, 1, 1, 2, 2]
 
 
@@ -80,20 +70,22 @@ def test_length_is_minutes_or_steps() -> None:
         ("max_gaussians", 0),
         ("longest", 8),
         ("sh_degree", 4),
-        ("position_rate", 0.0),
-        ("final_rate", -1.0),
         ("noise", -1.0),
         ("dssim_weight", 1.1),
-        ("half_until", -0.1),
-        ("start_opacity", 1.0),
-        ("dead_opacity", 0.0),
         ("densify_every", 0),
-        ("grow_until", 0.0),
     ],
 )
 def test_values_out_of_range_are_named(field: str, value: float) -> None:
     with pytest.raises(RangeError, match=field):
         FitOptions(**{field: value})
+
+
+@pytest.mark.parametrize(
+    ("field", "instead"), [("position_rate", "`rates` chooses"), ("grow_until", "half-way")]
+)
+def test_options_that_went_say_what_to_use_instead(field: str, instead: str) -> None:
+    with pytest.raises(InputError, match=f"{field}: this option was removed; .*{instead}"):
+        FitOptions(**{field: 0.1})
 
 
 def test_presets_differ_in_length_and_size() -> None:
@@ -103,7 +95,7 @@ def test_presets_differ_in_length_and_size() -> None:
     assert quick.max_gaussians < default.max_gaussians < full.max_gaussians
     assert default == FitOptions()
     assert (default.antialiased, default.low_pass_drawn) == (True, 0.1)
-    assert (full.antialiased, full.low_pass_drawn) == (False, 0.3)
+    assert (full.antialiased, full.low_pass_drawn, full.rates) == (False, 0.3, "published")
     with pytest.raises(InputError, match="preset: expected one of quick, default, full"):
         FitOptions.preset("slow")
 

@@ -21,7 +21,7 @@ from splatseg.fit import (
     refine,
     refinement_options,
 )
-from splatseg.fit._poses import exponential
+from splatseg.fit._views import exponential
 from splatseg.io.images import save_png
 from splatseg.lift import GaussianField
 from splatseg.render import render
@@ -147,7 +147,9 @@ def test_a_fit_tells_the_exposures_it_learned(unequal) -> None:
     assert not fit(capture, options=replace(options, steps=2, exposure=False)).exposures
 
 
-def test_poses_of_the_fit_are_gone_on_with(photograph, scene_photographed, rng) -> None:
+def test_poses_of_the_fit_are_gone_on_with(
+    photograph, scene_photographed, rng, monkeypatch
+) -> None:
     """Wrong poses, one per view: refined with the scene they move back, else they stay."""
     capture = photograph(count=15, arc=1.2, width=128, height=112, fx=160.0, fy=160.0)
     wrong = []
@@ -161,7 +163,8 @@ def test_poses_of_the_fit_are_gone_on_with(photograph, scene_photographed, rng) 
     asked = []
 
     def run(refine_poses: bool) -> Refinement:
-        options = replace(BLACK, refine_poses=refine_poses, pose_rate=0.3)
+        monkeypatch.setattr("splatseg.fit._views._POSE_RATE", 0.3)
+        options = replace(BLACK, refine_poses=refine_poses)
         bright = scene_photographed.replace(sh=0.75 * scene_photographed.sh - 0.44)
         run = Refinement(bright, wrong, steps=120, start=0.0, options=options, backend="cpu")
 
@@ -261,24 +264,21 @@ def test_the_options_of_a_fit_that_compare_photographs_are_taken() -> None:
         longest=700,
         masks="alpha",
         exposure=True,
-        exposure_rate=0.01,
-        exposure_prior=0.5,
         depth="relative",
         depth_weight=0.7,
         refine_poses=True,
-        position_rate=1e-5,
     )
     names = (
         "background",
         "longest",
         "masks",
         "exposure",
-        "exposure_rate",
-        "exposure_prior",
         "depth",
         "depth_weight",
     )
-    record = {name: getattr(fitted, name) for name in (*names, "refine_poses", "position_rate")}
+    # What version 0.1 recorded besides, which is no option any more, is not looked at.
+    record = {name: getattr(fitted, name) for name in (*names, "refine_poses")}
+    record |= {"exposure_rate": 0.01, "position_rate": 1e-5}
     record["background"] = [0, 0.5, 1]
     found = refinement_options({"options": record | {"of a later version": 3}})
     assert found == FitOptions(**{name: getattr(fitted, name) for name in names})

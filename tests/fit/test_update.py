@@ -9,11 +9,17 @@ import torch
 
 from splatseg import _native
 from splatseg.core import Gaussians
-from splatseg.fit._parameters import Parameters
-from splatseg.fit._schedule import Rates
-from splatseg.fit._update import UpdateSettings, update_rows, update_rows_torch
+from splatseg.fit._parameters import (
+    Parameters,
+    StepRates,
+    UpdateSettings,
+    update_rows,
+    update_rows_torch,
+)
 
-RATES = Rates(means=0.01, log_scales=0.02, rotations=0.03, logits=0.04, colour=0.05, sh_rest=0.06)
+RATES = StepRates(
+    means=0.01, log_scales=0.02, rotations=0.03, logits=0.04, colour=0.05, sh_rest=0.06
+)
 
 
 def _tensor(rng: np.random.Generator, *shape: int) -> torch.Tensor:
@@ -184,7 +190,7 @@ def _walked(opacity: float, count: int, **settings: object) -> torch.Tensor:
         opacities=torch.full((count,), 1e-20),
         sh=torch.zeros(count, 1, 3),
     )
-    still = Rates(means=0, log_scales=0, rotations=0, logits=0, colour=0, sh_rest=0)
+    still = StepRates(means=0, log_scales=0, rotations=0, logits=0, colour=0, sh_rest=0)
     chosen = replace(UpdateSettings(rates=still, step=3, noise=0.3, seed=5), **settings)
     moments = parameters.zeros_like(), parameters.zeros_like()
     update_rows(parameters, *moments, zero, rows=torch.arange(count), settings=chosen)

@@ -15,7 +15,7 @@ from splatseg.render import (
     render,
     weights,
 )
-from splatseg.render import _registry as registry
+from splatseg.render import _backend as registry
 from splatseg.render.cuda import GSPLAT_ALPHA_MAX
 
 

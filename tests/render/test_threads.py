@@ -32,7 +32,7 @@ def _everything(bench, rng) -> dict[str, torch.Tensor]:
     wide.image.square().sum().backward()
     back = bench.back_project(scene, camera, image)
     csr = bench.weights(scene, camera)
-    blocks = bench.weights(scene, camera, layout="blocks")
+    blocks = bench.image_weights(scene, camera)
     pixels = torch.stack((torch.arange(90), torch.arange(90)), dim=1)
     rows = bench.contributors(scene, camera, pixels, 5)
     return {

@@ -5,7 +5,7 @@ import torch
 
 from splatseg.core import Camera, Gaussians
 from splatseg.errors import InputError
-from splatseg.render import back_project, contributors, render, weights
+from splatseg.render import back_project, contributors, image_weights, render, weights
 from splatseg.render.warp import Warp, undistorted_camera, warp_into_photograph
 
 BACKEND = "reference"
@@ -121,8 +121,8 @@ def test_contributors_and_w_read_the_nearest_straight_pixel(gaussians) -> None:
     torch.testing.assert_close(
         some.product(ones)[:, 0], alpha[pixels[:, 1], pixels[:, 0]], rtol=0, atol=2e-3
     )
-    with pytest.raises(InputError, match="blocks"):
-        weights(gaussians, camera, layout="blocks", backend=BACKEND)
+    with pytest.raises(InputError, match="camera: expected one without distortion"):
+        image_weights(gaussians, camera, backend=BACKEND)
 
 
 @pytest.mark.parametrize("lens", LENSES)

@@ -7,11 +7,10 @@ import torch
 
 from splatseg.core import Camera, LayerInfo, Renderable, RenderableView
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.street import reference
-from splatseg.street.field import MeshField
-from splatseg.street.hits_reference import mesh_hits
-from splatseg.street.point_query import BallQuery
-from splatseg.street.radiance.model import RadianceModel
+from splatseg.street.field import BallQuery, MeshField
+from splatseg.street.radiance import RadianceModel
+from street import reference
+from street.reference import mesh_hits
 from support.mesh_fields import IDS, SMALL, balls, random_field, told_field
 
 CAR, SKY = 8, 5
@@ -94,23 +93,6 @@ def test_half_transparent_surfaces_are_composited_front_to_back() -> None:
     far = near + 2 * (2 - near)
     assert near == pytest.approx(1.5, abs=0.05)
     assert float(signals.depth[15, 20]) == pytest.approx((0.5 * near + 0.25 * far) / 0.75, abs=1e-3)
-
-
-def test_without_a_background_nothing_is_said_of_what_nothing_covers() -> None:
-    from dataclasses import replace
-
-    mesh = balls([[0.013, 0.007, 2]])
-    model = RadianceModel(mesh, IDS, replace(SMALL, background="none"))
-    with torch.no_grad():
-        model.opacity.bias.fill_(30)
-        model.opacity.weight.zero_()
-    field = MeshField(mesh, model)
-    hit = torch.isfinite(first_hits(field, camera()))
-    with field.view(camera()) as view:
-        shown, sure = view.label_map("semantic"), view.confidence("semantic")
-    assert torch.equal(shown.ids >= 0, hit)
-    assert torch.equal(sure >= 0, hit)
-    assert bool((shown.confidence[~hit] == 0).all())
 
 
 def test_what_is_asked_first_does_not_matter() -> None:

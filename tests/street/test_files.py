@@ -11,12 +11,7 @@ from splatseg.errors import FileFormatError, InputError, MissingFileError, Splat
 from splatseg.io.tensors import read_safetensors
 from splatseg.io.tensors_writing import write_tensors
 from splatseg.street.field import VERTEX_RULES, MeshField
-from splatseg.street.files import (
-    FORMAT,
-    load_mesh_field,
-    load_mesh_field_layer,
-    save_mesh_field,
-)
+from splatseg.street.files import FORMAT, load_mesh_field, load_mesh_field_layer, save_mesh_field
 from support.mesh_fields import SMALL, balls, random_field, told_field
 
 
@@ -109,8 +104,8 @@ def test_no_file_and_other_files(tmp_path: Path) -> None:
         ({"info": []}, r"expected an object as info, got \[\]"),
         ({"info": {"version": 9}}, "record of version 1 or less, got version 9"),
         ({"options": 3}, "expected an object as options, got 3"),
-        ({"options": {}}, "options: expected feature_size, .*, got none"),
-        ({"options": asdict(SMALL) | {"colour": 3}}, "of this splatseg, got 'colour'; a later"),
+        ({"options": {}}, "options: expected those .*background_widths, .*, got none"),
+        ({"options": asdict(SMALL) | {"colour": 3}}, "of this splatseg .*, got colour; a later"),
         ({"options": asdict(SMALL) | {"width": "16"}}, "width"),
         ({"options": asdict(SMALL) | {"width": 16.5}}, "width"),
         ({"options": asdict(SMALL) | {"width": True}}, "width"),

@@ -12,9 +12,13 @@ import torch
 from torch import Tensor
 
 from splatseg.core import Camera
+from splatseg.core.options import removed_options
+from splatseg.errors import FileFormatError
 from splatseg.io.tensors import read_safetensors
+from splatseg.io.tensors_writing import write_tensors
 from splatseg.street.field import MeshField
 from splatseg.street.files import load_mesh_field, save_mesh_field
+from splatseg.street.radiance import RadianceOptions
 
 
 @pytest.fixture(scope="module")
@@ -106,18 +110,32 @@ def test_views_and_points_are_as_recorded(golden: ModuleType, version_1: Path) -
     assert bool(((alpha > 0.5) & (alpha < 0.97)).any())
 
 
-@pytest.mark.bits
-def test_it_is_written_to_the_same_bytes(
-    golden: ModuleType, version_1: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_it_is_written_as_it_was_read_without_options_that_are_none_any_more(
+    golden: ModuleType, version_1: Path, tmp_path: Path
 ) -> None:
-    committed = version_1 / golden.FIELD
-    again = tmp_path / "again.safetensors"
+    committed, again = version_1 / golden.FIELD, tmp_path / "again.safetensors"
     save_mesh_field(load_mesh_field(committed), again)
-    assert again.read_bytes() == committed.read_bytes()
-    monkeypatch.setattr(golden, "ROOT", tmp_path / "field-v1")
-    golden.main()
-    assert (tmp_path / "field-v1" / golden.FIELD).read_bytes() == committed.read_bytes()
-    assert (tmp_path / "field-v1" / golden.SHOWN).is_file()
+    (before, old), (after, new) = read_safetensors(committed), read_safetensors(again)
+    assert list(before) == list(after)
+    assert all(torch.equal(before[name], after[name]) for name in before)
+    old_about, new_about = json.loads(old["about"]), json.loads(new["about"])
+    gone = old_about["options"].keys() - new_about["options"].keys()
+    assert gone == {*removed_options(RadianceOptions)}
+    old_about["options"] = {k: v for k, v in old_about["options"].items() if k not in gone}
+    assert new_about == old_about
+
+
+@pytest.mark.parametrize(("name", "value"), [("background", "none"), ("view_encoding", "view")])
+def test_what_no_field_has_any_more_is_refused(
+    golden: ModuleType, version_1: Path, tmp_path: Path, name: str, value: str
+) -> None:
+    tensors, metadata = read_safetensors(version_1 / golden.FIELD)
+    about = json.loads(metadata["about"])
+    about["options"][name] = value
+    path = tmp_path / "other.safetensors"
+    write_tensors(tensors, path, metadata=metadata | {"about": json.dumps(about)})
+    with pytest.raises(FileFormatError, match=f"as {name}, which no field has another of"):
+        load_mesh_field(path)
 
 
 def test_the_file_is_as_the_page_of_formats_says(golden: ModuleType, version_1: Path) -> None:

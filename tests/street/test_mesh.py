@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.street.mesh import PrimitiveMesh, primitive_faces
+from splatseg.street.primitives import PrimitiveMesh, primitive_faces
 from splatseg.street.shapes import template
 
 

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from splatseg import _native
 from splatseg.errors import RangeError, ShapeError
-from splatseg.street import reference
-from splatseg.street.point_query import BallQuery
+from splatseg.street.field import BallQuery
+from street import reference
 
 
 def field(count: int, classes: int, seed: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -104,7 +104,7 @@ def test_blocks_and_threads_do_not_matter(monkeypatch: pytest.MonkeyPatch) -> No
     points = torch.randn(999, 3, generator=torch.Generator().manual_seed(6))
     query = BallQuery(vertices, opacity, probabilities, radius=0.4)
     want, before = query.columns(points), _native.threads()
-    monkeypatch.setattr("splatseg.street.point_query._POINTS", 100)
+    monkeypatch.setattr("splatseg.street.field._POINTS", 100)
     try:
         for threads in (1, 3):
             _native.set_threads(threads)

@@ -10,7 +10,6 @@ import torch
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.street.primitives import Primitives, voxel_primitives, world_vertices
 from splatseg.street.shapes import (
-    ShapeAutoEncoder,
     ShapeConfig,
     new_shapes,
     primitive_scale,
@@ -43,11 +42,10 @@ def test_each_voxel_with_a_point_has_one_primitive_a_level(rng: np.random.Genera
     assert made.sizes == (0.5, 1.0)
 
 
-@pytest.mark.parametrize("start", ["sphere", "encoded"])
-def test_the_order_of_points_is_free(start: str, rng: np.random.Generator) -> None:
+def test_the_order_of_points_is_free(rng: np.random.Generator) -> None:
     points = cloud(rng)
-    one = voxels(points, start=start)
-    two = voxels(points[torch.from_numpy(rng.permutation(len(points)))], start=start)
+    one = voxels(points)
+    two = voxels(points[torch.from_numpy(rng.permutation(len(points)))])
     assert torch.equal(one.centres, two.centres)
     assert torch.equal(one.codes, two.codes)
 
@@ -74,27 +72,6 @@ def test_points_all_in_one_voxel_have_one_primitive_a_level() -> None:
     torch.testing.assert_close(made.centres, torch.full((2, 3), 0.2), atol=1e-3, rtol=0)
 
 
-def test_a_sparse_coarse_level_takes_what_the_fine_one_left() -> None:
-    dense = torch.full((3, 3), 0.2)
-    lonely = torch.tensor([[0.7, 0.2, 0.2], [5.2, 0.2, 0.2]])
-    points = torch.cat((dense, lonely))
-    made = voxels(points, coarse="sparse", min_points=2)
-    assert made.levels.tolist() == [0, 1, 1]
-    torch.testing.assert_close(made.centres[1:], lonely, atol=1e-3, rtol=0)
-    everywhere = voxels(points, min_points=2)
-    assert everywhere.levels.tolist() == [0, 1]
-    assert everywhere.centres[1, 0].item() == pytest.approx((3 * 0.2 + 0.7) / 4, abs=1e-3)
-
-
-def test_encoded_codes_are_those_of_the_points(rng: np.random.Generator) -> None:
-    inside = torch.from_numpy(rng.uniform(0.02, 0.48, size=(50, 3)))
-    few = inside[:7] + torch.tensor([3.0, 0, 0])
-    made = voxels(torch.cat((inside, few)), sizes=(0.5,), start="encoded")
-    local = (inside - made.centres[0]) / primitive_scale(0.5)
-    torch.testing.assert_close(made.codes[0], shipped().encode(local.float()[None])[0])
-    torch.testing.assert_close(made.codes[1], sphere())
-
-
 def test_the_sphere_is_searched_for_where_none_is_given() -> None:
     shapes = new_shapes(ShapeConfig(code_size=3, encoder_widths=(4,), decoder_widths=(4,)), seed=0)
     made = voxel_primitives(torch.zeros(1, 3), shapes=shapes, sizes=(1.0,))
@@ -111,9 +88,6 @@ def test_the_sphere_is_searched_for_where_none_is_given() -> None:
         (torch.zeros(2, 3), {"sizes": (0.5, 0.0)}, "sizes: expected positive"),
         (torch.zeros(2, 3), {"sizes": ()}, "sizes: expected positive"),
         (torch.zeros(2, 3), {"metres_per_unit": 0.0}, "metres_per_unit: expected a positive"),
-        (torch.zeros(2, 3), {"min_points": 3}, "expected voxels with 3 points each"),
-        (torch.zeros(2, 3), {"coarse": "never"}, "coarse: expected one of"),
-        (torch.zeros(2, 3), {"start": "cube"}, "start: expected one of"),
     ],
 )
 def test_bad_points_and_options_are_refused(
@@ -121,12 +95,6 @@ def test_bad_points_and_options_are_refused(
 ) -> None:
     with pytest.raises(InputError, match=message):
         voxels(points, **options)
-
-
-def test_encoding_needs_an_encoder() -> None:
-    decoder = ShapeAutoEncoder(shipped().config, has_encoder=False)
-    with pytest.raises(InputError, match="encoder"):
-        voxel_primitives(torch.zeros(9, 3), shapes=decoder, sphere=sphere(), start="encoded")
 
 
 def test_vertices_are_decoded_scaled_and_moved() -> None:

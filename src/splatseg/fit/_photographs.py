@@ -10,8 +10,7 @@ from torch import Tensor
 
 from splatseg.core import Camera, View
 from splatseg.core.boundary import boundary
-from splatseg.fit._background import fixed_colour
-from splatseg.fit._options import FitOptions
+from splatseg.fit._options import FitOptions, fixed_colour
 from splatseg.io.images import image_camera, load_alpha, load_image, load_mask, reduced_size
 from splatseg.render.warp import photograph_to_pinhole, undistorted_camera
 

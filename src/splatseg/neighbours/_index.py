@@ -1,17 +1,82 @@
-"""The index that searches are made in."""
+"""What a search finds."""
 
 import math
+from dataclasses import dataclass
 
+import numpy as np
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float, Float64, Int64
 from torch import Tensor
 
-from splatseg._check import check_shape, check_values
+from splatseg._check import check_finite, check_shape, check_values
 from splatseg._native import NeighbourIndex as NativeIndex
 from splatseg.core import Gaussians
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.neighbours._results import NeighbourLists, Neighbours, square_root
+
+
+def square_root(squared: Float64[Tensor, "*shape"]) -> Float64[Tensor, "*shape"]:
+    """Square roots rounded correctly: torch's may be off in the last bit."""
+    return torch.from_numpy(np.sqrt(squared.numpy()))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Neighbours:
+    """The k nearest points of each query, nearest first, of equally near ones the lower index."""
+
+    indices: Int64[Tensor, "m k"]
+    """Rows of the points, -1 where there are fewer than k."""
+
+    distances: Float64[Tensor, "m k"]
+    """How far they are, in the unit of the points; infinite where there are fewer than k."""
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class NeighbourLists:
+    """The points within a radius of each query, as sparse rows (CSR).
+
+    Those of query i are ``indices[starts[i]:starts[i + 1]]``, nearest first, of equally near
+    ones the lower index first.
+    """
+
+    starts: Int64[Tensor, "m+1"]
+    """Where each query's points begin; the last value is how many pairs there are."""
+
+    indices: Int64[Tensor, "pairs"]
+    """Rows of the points."""
+
+    distances: Float64[Tensor, "pairs"]
+    """How far they are, in the unit of the points."""
+
+    def __len__(self) -> int:
+        return len(self.starts) - 1
+
+    @property
+    def counts(self) -> Int64[Tensor, "m"]:
+        """How many points each query has."""
+        return self.starts.diff()
+
+    def to(self, device: torch.device) -> "NeighbourLists":
+        """The same on a device."""
+        return NeighbourLists(
+            starts=self.starts.to(device),
+            indices=self.indices.to(device),
+            distances=self.distances.to(device),
+        )
+
+    @property
+    def queries(self) -> Int64[Tensor, "pairs"]:
+        """The query of each pair: with `indices` the edges of a graph."""
+        return torch.repeat_interleave(
+            torch.arange(len(self), device=self.starts.device), self.counts
+        )
+
+
+# The index that searches are made in.
+
 
 MAX_DIMENSIONS = 8
 """Columns that points may have."""
@@ -309,3 +374,52 @@ def _check_count(name: str, count: int) -> None:
 def _check_distance(name: str, distance: float) -> None:
     if not distance >= 0:
         raise RangeError(f"{name}: expected a distance of at least 0, got {distance}.")
+
+
+# Means of values over balls, weighted by inverse distance, without a list of pairs.
+
+
+@boundary
+def ball_means(
+    index: NeighbourIndex,
+    values: Float[Tensor, "n c"],
+    queries: Float[Tensor, "m 3"],
+    radius: float,
+) -> tuple[Float64[Tensor, "m c"], Int64[Tensor, "m"]]:
+    r"""Inverse-distance weighted means of values of the points in a ball around each query.
+
+    .. math:: m(q) = \frac{\sum_i w_i v_i}{\sum_i w_i}, \qquad
+              w_i = \frac{1}{\lVert p_i - q \rVert}, \qquad \lVert p_i - q \rVert \le r
+
+    Points exactly at the query have all the weight, in equal parts: the limit. Values are taken
+    as float32, sums are float64, in an order that depends on the index and the query alone.
+
+    Args:
+        index: Of points with three columns.
+        values: A row for each of its points, finite.
+        queries: Positions, in the unit and frame of the points.
+        radius: Of the ball, its border included; at least 0.
+
+    Returns:
+        The means, 0 where no point is in the ball, and how many points were in it.
+
+    Raises:
+        ShapeError: If there is not a row for each point, or queries are not (m, 3).
+        RangeError: If the radius is negative or NaN, or a value or query is not finite.
+        InputError: If the index has not three columns.
+    """
+    if index.dimensions != 3:
+        raise InputError(f"index: expected points of three columns, got {index.dimensions}.")
+    check_shape("values", values, (len(index), None))
+    check_finite("values", values)
+    check_shape("queries", queries, (None, 3))
+    if not radius >= 0:
+        raise RangeError(f"radius: expected a distance of at least 0, got {radius}.")
+    asked = queries.detach().cpu().double().contiguous()
+    if len(asked) and not bool((asked.abs() <= MAX_COORDINATE).all()):
+        raise RangeError(f"queries: expected coordinates of at most {MAX_COORDINATE:g}.")
+    means = torch.empty(len(asked), values.shape[1], dtype=torch.float64)
+    counts = torch.empty(len(asked), dtype=torch.int64)
+    rows = values.detach().cpu().float().contiguous()
+    index.native.ball_means(asked, radius * radius, rows, means, counts)
+    return means.to(queries.device), counts.to(queries.device)

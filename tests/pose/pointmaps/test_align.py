@@ -4,10 +4,15 @@ import numpy as np
 import pytest
 import torch
 
-from splatseg.pose.pointmaps import PointmapOptions
-from splatseg.pose.pointmaps._solve import solve
 from splatseg.synthetic import PointmapErrors
-from support.pointmaps import CameraErrors, PhotographedRoom, aligned_cameras, complete, window
+from support.pointmaps import (
+    CameraErrors,
+    PhotographedRoom,
+    aligned_cameras,
+    complete,
+    solved,
+    window,
+)
 
 WRONG = PointmapErrors(outliers=0.1)
 """2 % of noise, 3 % of warp, units from 0.5 to 2, a fifth of the confidences by chance."""
@@ -15,7 +20,7 @@ WRONG = PointmapErrors(outliers=0.1)
 
 def _errors(room: PhotographedRoom, pairs, errors=None, seed: int = 0, **options) -> CameraErrors:
     samples = room.samples(pairs, errors or PointmapErrors(), seed)
-    found = solve(samples, options=PointmapOptions(**options), progress=lambda done, total: None)
+    found = solved(samples, **options)
     assert float(found.scale.log().mean()) == pytest.approx(0, abs=1e-9)  # their product is one
     return room.errors_of(aligned_cameras(room, found))
 
@@ -46,7 +51,7 @@ def test_outliers_lose_their_weight_and_the_published_alignment_believes_them(ph
     bad = torch.tensor([pair in wrong for pair in named])
     assert int(bad.sum()) == 6
     samples = photographed.samples(pairs, WRONG)
-    found = solve(samples, options=PointmapOptions(), progress=lambda done, total: None)
+    found = solved(samples)
     assert float(found.weight[bad].max()) < 0.1
     assert float(found.weight[~bad].min()) > 0.3
     published = _errors(photographed, pairs, WRONG, alignment="published", iterations=150)
@@ -67,7 +72,7 @@ def test_a_pair_of_no_geometry_spoils_nothing(photographed, bad: str) -> None:
 
 
 def _limit(room: PhotographedRoom, samples) -> float:
-    found = solve(samples, options=PointmapOptions(), progress=lambda done, total: None)
+    found = solved(samples)
     return float(room.errors_of(aligned_cameras(room, found)).centre.max())
 
 
@@ -95,9 +100,6 @@ def test_more_steps_are_better_than_one(photographed) -> None:
 @pytest.mark.bits
 def test_the_same_samples_give_the_same_bits(photographed) -> None:
     samples = photographed.samples(window(8, 2), WRONG)
-    one, two = (
-        solve(samples, options=PointmapOptions(iterations=5), progress=lambda d, t: None)
-        for _ in range(2)
-    )
+    one, two = (solved(samples, iterations=5) for _ in range(2))
     assert torch.equal(one.centre, two.centre)
     assert torch.equal(one.depth, two.depth)

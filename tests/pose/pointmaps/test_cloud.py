@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from splatseg.core import Pointmap
-from splatseg.pose.pointmaps._align import Aligned
-from splatseg.pose.pointmaps._cloud import read_depth_maps
-from splatseg.pose.pointmaps._samples import PairSamples, PhotographSize
+from splatseg.pose._pointmap_align import Aligned
+from splatseg.pose._pointmap_pixels import PairSamples, PhotographSize
+from splatseg.pose.pointmaps import read_depth_maps
 
 SIZES = ((2, 3), (2, 3))
 PHOTOGRAPHS = [PhotographSize(name=name, width=6, height=4) for name in ("a", "b")]

@@ -6,19 +6,24 @@ import numpy as np
 import pytest
 import torch
 
+from splatseg.core.rigid import best_similarity
 from splatseg.errors import InputError
-from splatseg.pose.pointmaps._averaging import average, geman_mcclure, graph_solve
-from splatseg.pose.pointmaps._focal import lens_focals, weiszfeld_focal
-from splatseg.pose.pointmaps._geometry import pair_geometry, ray_directions
-from splatseg.pose.pointmaps._resection import resect, similarity
-from splatseg.pose.pointmaps._start import (
+from splatseg.pose._pointmap_start import (
     agreement,
+    average,
     confidence_score,
+    geman_mcclure,
+    graph_solve,
+    lens_focals,
+    pair_geometry,
+    ray_directions,
+    resect,
     rotation_angle,
     rotation_of_vector,
     rotation_vector,
     spanning_tree,
     tree_world,
+    weiszfeld_focal,
 )
 from splatseg.synthetic import PointmapErrors
 from support.pointmaps import complete, window
@@ -91,7 +96,7 @@ def test_similarity_is_found_exactly(rng) -> None:
     turn = rotation_of_vector(torch.from_numpy(rng.normal(size=(3, 3))))
     target = 2.5 * source @ turn.transpose(1, 2) + 1
     weights = torch.from_numpy(rng.uniform(1, 2, size=(3, 20)))
-    scale, rotation, shift = similarity(source, target, weights)
+    scale, rotation, shift = best_similarity(source, target, weights)
     torch.testing.assert_close(scale, torch.full((3,), 2.5).double())
     torch.testing.assert_close(rotation, turn)
     torch.testing.assert_close(shift, torch.ones(3, 3).double())
@@ -139,7 +144,7 @@ def test_exact_pairs_give_exact_worlds_along_the_tree_and_on_average(photographe
             off = rotation_angle(turn @ found.rotation[i] @ camera.cam_from_world[:3, :3])
             assert math.degrees(float(off)) < 0.05
         ours, theirs = found.centre, torch.stack([camera.centre for camera in true])
-        scale, turned, shift = similarity(ours[None], theirs[None], torch.ones(1, 8).double())
+        scale, turned, shift = best_similarity(ours[None], theirs[None], torch.ones(1, 8).double())
         moved = scale * ours @ turned[0].T + shift
         assert float((moved - theirs).norm(dim=1).max()) < 2e-3 * float(theirs.std(dim=0).norm())
 

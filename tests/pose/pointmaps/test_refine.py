@@ -6,26 +6,35 @@ import numpy as np
 import pytest
 import torch
 
-from splatseg.pose.pointmaps import PointmapOptions
-from splatseg.pose.pointmaps._align import Aligned
-from splatseg.pose.pointmaps._bundle import _MAX_CHANGE, damped_step, normal_equations
-from splatseg.pose.pointmaps._refine import refine, weighed
-from splatseg.pose.pointmaps._residuals import Problem, Spread, seen
-from splatseg.pose.pointmaps._samples import PairSamples
-from splatseg.pose.pointmaps._solve import solve
-from splatseg.pose.pointmaps._start import rotation_of_vector
+from splatseg.pose._pointmap_align import Aligned
+from splatseg.pose._pointmap_pixels import PairSamples
+from splatseg.pose._pointmap_refine import (
+    _MAX_CHANGE,
+    Problem,
+    Spread,
+    damped_step,
+    normal_equations,
+    refine,
+    seen,
+    weighed,
+)
+from splatseg.pose._pointmap_start import rotation_of_vector
+from splatseg.pose.pointmaps import PointmapOptions, solve
 from splatseg.synthetic import PointmapErrors
-from support.pointmaps import CameraErrors, PhotographedRoom, aligned_cameras, complete, window
+from support.pointmaps import (
+    CameraErrors,
+    PhotographedRoom,
+    aligned_cameras,
+    complete,
+    solved,
+    window,
+)
 
 WRONG = PointmapErrors(outliers=0.1)
 SPREAD = Spread(across=0.01, along=0.05)
 
 
 def _silent(done: int, total: int) -> None: ...
-
-
-def _solved(samples: PairSamples, **options) -> Aligned:
-    return solve(samples, options=PointmapOptions(**options), progress=_silent)
 
 
 def _off(room: PhotographedRoom, found: Aligned) -> CameraErrors:
@@ -50,7 +59,7 @@ def _changed(samples: PairSamples, state: Aligned, pair: int, step: torch.Tensor
 def test_the_slope_and_the_curvature_are_those_of_the_sum(photographed) -> None:
     """The slope is that of the cost itself; squares of the Jacobian by differences of residuals."""
     samples = photographed.samples(window(8, 2), PointmapErrors())
-    state = _solved(samples, iterations=3, refine=False)
+    state = solved(samples, iterations=3, refine=False)
     pair = 5
     chosen = torch.tensor([pair])
     problem = Problem(samples=samples, views=torch.arange(8), pairs=chosen, spread=SPREAD)
@@ -80,7 +89,7 @@ def test_the_slope_and_the_curvature_are_those_of_the_sum(photographed) -> None:
 def test_a_step_is_that_of_the_whole_equations(photographed) -> None:
     """Scales eliminated pair by pair give what one system with them in it gives."""
     samples = photographed.samples(window(8, 1), PointmapErrors())
-    state, spread = weighed(samples, _solved(samples, iterations=2, refine=False))
+    state, spread = weighed(samples, solved(samples, iterations=2, refine=False))
     pairs = torch.arange(len(samples))
     problem = Problem(samples=samples, views=torch.arange(8), pairs=pairs, spread=spread)
     size = 7 * 8 + 1 + len(samples)
@@ -109,7 +118,7 @@ def test_a_step_is_that_of_the_whole_equations(photographed) -> None:
 
 def test_photographs_that_stand_still_do(photographed) -> None:
     samples = photographed.samples(window(8, 2), PointmapErrors())
-    state, spread = weighed(samples, _solved(samples, iterations=2, refine=False))
+    state, spread = weighed(samples, solved(samples, iterations=2, refine=False))
     views = torch.tensor([2, 3])
     pairs = torch.isin(samples.views, views).any(dim=1).nonzero()[:, 0]
     problem = Problem(samples=samples, views=views, pairs=pairs, spread=spread)
@@ -130,7 +139,7 @@ def test_cameras_are_better_by_a_third_and_more(photographed) -> None:
         rotation, centre = [], []
         for seed in range(3):
             samples = photographed.samples(complete(8), errors, seed)
-            before, after = (_off(photographed, _solved(samples, refine=x)) for x in (False, True))
+            before, after = (_off(photographed, solved(samples, refine=x)) for x in (False, True))
             rotation.append((before.rotation.max(), after.rotation.max()))
             centre.append((before.centre.max(), after.centre.max()))
         for pairs in (rotation, centre):
@@ -144,7 +153,7 @@ def test_outliers_lose_their_weight_though_the_start_believed_them(photographed)
     wrong = photographed.answers(pairs, WRONG).outliers
     bad = torch.tensor([pair in wrong for pair in named])
     samples = photographed.samples(pairs, WRONG)
-    start = _solved(samples, refine=False)
+    start = solved(samples, refine=False)
     believed = replace(start, weight=torch.ones_like(start.weight))
     found = refine(samples, believed, progress=_silent)
     assert float(found.weight[bad].max()) < 0.1
@@ -156,7 +165,7 @@ def test_spreads_are_those_of_the_errors(photographed) -> None:
     """Noise alone of 4 % along and 1 % across: measured as that, and pairs are believed alike."""
     errors = PointmapErrors(noise=0.04, sideways=0.25, warp=0, wrong_confidence=0)
     samples = photographed.samples(complete(8), errors)
-    state, spread = weighed(samples, _solved(samples))
+    state, spread = weighed(samples, solved(samples))
     assert spread.along == pytest.approx(0.04, rel=0.15)
     assert spread.across == pytest.approx(0.01, rel=0.15)
     assert float(state.weight.min()) > 0.6
@@ -164,7 +173,7 @@ def test_spreads_are_those_of_the_errors(photographed) -> None:
 
 def test_some_at_a_time_end_near_where_all_at_once_do(photographed) -> None:
     samples = photographed.samples(complete(8), WRONG)
-    start = _solved(samples, refine=False)
+    start = solved(samples, refine=False)
     whole = _off(photographed, refine(samples, start, progress=_silent))
     parts = _off(photographed, refine(samples, start, progress=_silent, together=4))
     assert parts.rotation.max() < whole.rotation.max() + 0.15

@@ -20,7 +20,7 @@ def dense(drive: Drive, points: torch.Tensor) -> torch.Tensor:
 
 
 def reference(drive: Drive, point: torch.Tensor) -> list[float]:
-    """The equation of `splatseg.street.blocks.cut`, one number at a time."""
+    """The equation of `splatseg.street.blocks`, one number at a time."""
 
     def to_segment(a: torch.Tensor, b: torch.Tensor) -> float:
         way, offset = b - a, point - a

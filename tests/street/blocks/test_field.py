@@ -8,8 +8,8 @@ import torch
 
 from splatseg.core import Camera, PointLabels, Renderable, ScanSource
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.street.blocks import DriveBlockOptions, DriveField, DriveScans, cut_drive
-from splatseg.street.blocks.join import WeightedLabels, joined
+from splatseg.street.block_field import DriveField, DriveScans, WeightedLabels, joined
+from splatseg.street.blocks import DriveBlockOptions, cut_drive
 from street.blocks.support import NumberedScans, Opener, Says, crossing, own_number, straight
 
 

@@ -8,22 +8,19 @@ import pytest
 import torch
 
 from splatseg.errors import FileFormatError, InputError, MissingFileError, RangeError, ShapeError
-from splatseg.street.blocks import (
-    Drive,
-    DriveBlock,
-    DriveBlockOptions,
+from splatseg.street import files
+from splatseg.street.blocks import Drive, DriveBlock, DriveBlockOptions, cut_drive
+from splatseg.street.field import MeshField
+from splatseg.street.files import (
     block_file,
     build_blocks,
-    cut_drive,
     drive_about,
-    files,
     goes_on,
     load_drive,
     missing_blocks,
     open_blocks,
     save_drive,
 )
-from splatseg.street.field import MeshField
 from street.blocks.support import bend, straight
 from support.mesh_fields import IDS, balls, told_field
 

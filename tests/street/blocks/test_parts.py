@@ -10,13 +10,8 @@ from splatseg.core.scans import Scan
 from splatseg.errors import InputError
 from splatseg.io.captures import read_capture
 from splatseg.io.scans import read_scans
-from splatseg.street.blocks import (
-    DriveBlockOptions,
-    DriveScans,
-    block_capture,
-    cut_drive,
-    frame_centres,
-)
+from splatseg.street.block_field import DriveScans, block_capture
+from splatseg.street.blocks import DriveBlockOptions, cut_drive, frame_centres
 from street.blocks.support import NumberedScans, straight
 
 

@@ -9,8 +9,8 @@ import torch
 
 from splatseg.core import Camera, DepthMap, Scan, View
 from splatseg.errors import InputError, RangeError
-from splatseg.fit import ScanDepthOptions, scan_depths
-from splatseg.street.geometry import (
+from splatseg.fit import scan_depths
+from splatseg.street.depth_views import (
     capture_views,
     evidence_views,
     field_views,
@@ -55,9 +55,9 @@ class Maps:
 
 def test_scans_are_seen_as_a_fit_sees_them() -> None:
     cameras = [camera(), camera(10, 6)]
-    options = ScanDepthOptions(spacing=0.3)
-    views = list(scan_views(Scans(), cameras, options=options, metres_per_unit=2.0))
-    maps = scan_depths(Scans(), cameras, options=options, metres_per_unit=2.0)
+    options = {"spacing": 0.3}
+    views = list(scan_views(Scans(), cameras, **options, metres_per_unit=2.0))
+    maps = scan_depths(Scans(), cameras, **options, metres_per_unit=2.0)
     for view, one, depth in zip(views, cameras, maps, strict=True):
         assert view.camera is one
         assert torch.equal(view.depth, depth)

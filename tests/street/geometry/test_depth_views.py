@@ -7,8 +7,7 @@ import torch
 
 from splatseg.core import Camera
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.street.geometry import DepthView, distances_of
-from splatseg.street.geometry.depth_views import axis_cosines, collect_rays
+from splatseg.street.depth_views import DepthView, axis_cosines, collect_rays, distances_of
 
 
 def camera(width: int = 3, height: int = 1, *, x: float = 0.0) -> Camera:

@@ -5,10 +5,10 @@ import torch
 
 from splatseg.core import Camera
 from splatseg.errors import InputError
-from splatseg.raycast import reference
-from splatseg.street.geometry import PrimitiveCaster, enclosing, mesh_depth, mesh_distances
-from splatseg.street.mesh import PrimitiveMesh
+from splatseg.street.hits import PrimitiveCaster, enclosing, mesh_depth, mesh_distances
+from splatseg.street.primitives import PrimitiveMesh
 from splatseg.street.shapes import template
+from support import brute_rays as reference
 
 
 def mesh(places: list[tuple[list[float], float, int]]) -> PrimitiveMesh:

@@ -9,18 +9,17 @@ import torch
 
 from splatseg.core import Camera
 from splatseg.errors import InputError, RangeError, ShapeError
+from splatseg.street.depth_views import DepthView
 from splatseg.street.geometry import (
     PUBLISHED_GEOMETRY,
-    DepthView,
     GeometryFit,
     GeometryOptions,
     GeometryRecord,
     fit_geometry,
-    mesh_depth,
 )
-from splatseg.street.hits import MeshCaster
+from splatseg.street.hits import MeshCaster, mesh_depth
 from splatseg.street.primitives import Primitives, voxel_primitives
-from splatseg.street.shapes import ShapeConfig, mesh_regularisers, new_shapes, template
+from splatseg.street.shapes import ShapeConfig, new_shapes
 from support.primitives import shipped, sphere, spheres
 
 WALL, FLOOR = 6.0, 1.2
@@ -101,7 +100,7 @@ def test_the_number_of_threads_changes_no_bit() -> None:
     try:
         for count in (1, 2):
             torch.set_num_threads(count)
-            found.append(fitted(corner(), normal_weight=0.1))
+            found.append(fitted(corner()))
             assert torch.get_num_threads() == count
     finally:
         torch.set_num_threads(before)
@@ -192,16 +191,18 @@ def test_hits_are_searched_for_so_often(
     assert counts == casts
 
 
-def test_max_rays_bounds_what_is_kept() -> None:
+def test_what_is_kept_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     assert fitted(ahead()).rays == 768
-    assert fitted(ahead(), max_rays=200).rays <= 200
+    monkeypatch.setattr("splatseg.street.geometry._MAX_RAYS", 200)
+    assert fitted(ahead()).rays <= 200
 
 
-def test_max_depth_is_metres() -> None:
+def test_the_largest_depth_is_metres(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("splatseg.street.geometry.MAX_DEPTH", 4.9)
     primitives, view = ahead()
     with pytest.raises(InputError, match="depths: expected views with depth"):
-        fitted((primitives, view), max_depth=4.9)
-    options = GeometryOptions(iterations=0, max_depth=4.9)
+        fitted((primitives, view))
+    options = GeometryOptions(iterations=0)
     assert fit_geometry(primitives, shipped(), [view], options=options, metres_per_unit=0.5).rays
 
 
@@ -235,48 +236,6 @@ def test_error_to_the_plane_is_smaller_than_along_the_ray() -> None:
     assert plane < 0.9 * ray
 
 
-@pytest.mark.bits
-def test_truncation_leaves_out_rays_that_see_past() -> None:
-    far = ahead(depth=20.0)
-    assert same(fitted(far, truncation=2.0).primitives, far[0])
-    assert fitted(far, truncation=2.0).records[-1].loss == 0
-    assert not same(fitted(far).primitives, far[0])
-
-
-def test_distance_power_divides_errors() -> None:
-    """All measured points of one pixel are equally far."""
-    look = camera(1, 1)
-    scene = ahead()[0], DepthView(camera=look, depth=torch.full((1, 1), 5.0))
-    plain, divided = (
-        fitted(scene, iterations=1, distance_power=power).records[0].loss for power in (0.0, 2.0)
-    )
-    assert divided == pytest.approx(plain / 25)
-
-
-@pytest.mark.parametrize("option", ["normal_weight", "laplacian_weight", "edge_weight"])
-def test_regularisers_smooth_what_is_hit(option: str) -> None:
-    name = option.removesuffix("_weight")
-    _, faces = template()
-
-    def rough(**options: float) -> float:
-        found = fitted(ahead(), iterations=30, rate=0.05, offset_rate=0.0, **options).primitives
-        vertices = found.mesh(shipped()).vertices.view(-1, 42, 3) / found.scales[:, None, None]
-        return getattr(mesh_regularisers(vertices, faces), name).mean().item()
-
-    assert rough(**{option: 100.0}) < 0.99 * rough()
-
-
-def test_depth_weight_is_of_depth_beside_regularisers() -> None:
-    """Laplacians do not know where a primitive is: without depth, its centre stays."""
-    start = ahead()[0].centres
-    still, moved = (
-        fitted(ahead(), laplacian_weight=1.0, depth_weight=weight).primitives.centres - start
-        for weight in (0.0, 1.0)
-    )
-    assert float(moved[0, 2]) > 0.05
-    assert float(still.abs().max()) < 0.3 * float(moved[0, 2])
-
-
 def test_carve_removes_what_stands_before_surfaces() -> None:
     """The near sphere is seen through by all of its rays: they end at the wall."""
     view = ahead(depth=9.0)[1]
@@ -303,26 +262,24 @@ def test_a_camera_inside_a_primitive_is_refused_or_the_primitive_removed() -> No
 
 def test_published_is_what_paper_and_code_have() -> None:
     published = PUBLISHED_GEOMETRY
-    assert (published.iterations, published.rays, published.max_depth) == (5000, 4096, 50)
+    assert (published.iterations, published.rays) == (5000, 4096)
     assert (published.rate, published.depth_weight) == (5e-4, 0.05)
     assert published.error == "ray"
-    assert not published.regularised
     assert published.carve > 1
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"iterations": -1}, "iterations: expected a value"),
-        ({"rays": 0}, "rays: expected a value"),
-        ({"refresh": 0}, "refresh: expected a value"),
-        ({"reuse": 0}, "reuse: expected a value"),
-        ({"max_rays": 0}, "max_rays: expected a value"),
-        ({"rate": 0.0}, "rate: expected a positive"),
-        ({"rate": float("nan")}, "rate: expected a positive"),
-        ({"truncation": 0.0}, "truncation: expected a positive"),
-        ({"offset_rate": -1.0}, "offset_rate: expected 0 or more"),
-        ({"normal_weight": float("nan")}, "normal_weight: expected 0 or more"),
+        ({"iterations": -1}, "iterations: expected at least 0"),
+        ({"rays": 0}, "rays: expected at least 1"),
+        ({"refresh": 0}, "refresh: expected at least 1"),
+        ({"reuse": 0}, "reuse: expected at least 1"),
+        ({"max_rays": 1}, "max_rays: this option was removed"),
+        ({"rate": 0.0}, "rate: expected more than 0"),
+        ({"rate": float("nan")}, "rate: expected more than 0"),
+        ({"truncation": 2.0}, "truncation: this option was removed"),
+        ({"offset_rate": -1.0}, "offset_rate: expected at least 0"),
         ({"error": "square"}, "error: expected one of"),
     ],
 )

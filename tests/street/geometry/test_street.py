@@ -3,13 +3,9 @@
 import torch
 
 from splatseg.core import Camera
-from splatseg.street.geometry import (
-    DepthView,
-    GeometryOptions,
-    PrimitiveCaster,
-    fit_geometry,
-    mesh_depth,
-)
+from splatseg.street.depth_views import DepthView
+from splatseg.street.geometry import GeometryOptions, fit_geometry
+from splatseg.street.hits import PrimitiveCaster, mesh_depth
 from splatseg.street.primitives import voxel_primitives
 from splatseg.synthetic import SyntheticScene, cast, drive_cameras, street
 from support.primitives import shipped, sphere

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from splatseg.street.radiance import composite, reference
-from splatseg.street.radiance.compositing import ray_weights
+from splatseg.street.radiance import composite, ray_weights
+from street import reference
 
 
 def test_two_samples_and_a_background_by_hand() -> None:

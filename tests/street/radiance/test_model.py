@@ -7,12 +7,15 @@ import pytest
 import torch
 
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.street.radiance import PUBLISHED_RADIANCE, RadianceModel, RadianceOptions
-from splatseg.street.radiance.encoding import encode, encoded_size
-from splatseg.street.radiance.samples import Surface
+from splatseg.street.radiance import (
+    PUBLISHED_RADIANCE,
+    RadianceModel,
+    RadianceOptions,
+    encode,
+    encoded_size,
+)
+from splatseg.street.radiance_rendering import Surface
 from street.radiance.scene import IDS, SMALL, two_balls
-
-BACKGROUNDS = ("network", "constant", "none")
 
 
 def model(**changes: object) -> RadianceModel:
@@ -52,29 +55,16 @@ def test_opacity_and_classes_do_not_know_the_view() -> None:
     assert torch.equal(one.opacity, two.opacity)
     assert torch.equal(one.probabilities, two.probabilities)
     assert not torch.equal(one.colour, two.colour)
-    blind = model(view_encoding="none")
-    one, two = (blind.outputs(places, features, s * directions, normals) for s in (1, -1))
-    assert torch.equal(one.colour, two.colour)
+    turned = field.outputs(places, features, directions, -normals)
+    assert not torch.equal(one.colour, turned.colour)
 
 
-def test_normals_count_where_they_are_asked_for() -> None:
-    places, features, directions, normals = points(10)
-    for encoding, counts in (("normal_view", True), ("view", False)):
-        field = model(view_encoding=encoding)
-        one, two = (field.outputs(places, features, directions, s * normals) for s in (1, -1))
-        assert torch.equal(one.colour, two.colour) != counts
-
-
-@pytest.mark.parametrize("background", BACKGROUNDS)
-def test_backgrounds(background: str) -> None:
-    field = model(background=background)
-    directions = points(6)[2]
-    colour, probabilities = field.background_of(directions)
+def test_the_background_is_of_the_direction() -> None:
+    field = model()
+    colour, probabilities = field.background_of(points(6)[2])
     assert colour.shape == (6, 3)
-    total = torch.zeros(6) if background == "none" else torch.ones(6)
-    assert torch.allclose(probabilities.sum(dim=1), total, atol=1e-6)
-    alike = bool((colour == colour[:1]).all())
-    assert alike == (background != "network")
+    assert torch.allclose(probabilities.sum(dim=1), torch.ones(6), atol=1e-6)
+    assert not bool((colour == colour[:1]).all())
 
 
 def test_vertices_have_what_points_on_them_have() -> None:
@@ -95,7 +85,7 @@ def test_vertices_have_what_points_on_them_have() -> None:
 
 def test_vertices_do_not_depend_on_portions(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = model().vertex_outputs(two_balls())
-    monkeypatch.setattr("splatseg.street.radiance.model._VERTICES", 16)
+    monkeypatch.setattr("splatseg.street.radiance._VERTICES", 16)
     parts = model().vertex_outputs(two_balls())
     assert torch.allclose(whole[0], parts[0], atol=1e-6)
     assert torch.allclose(whole[1], parts[1], atol=1e-6)
@@ -161,8 +151,8 @@ def test_the_published_field_has_the_published_sizes() -> None:
         {"semantic_width": -1},
         {"colour_widths": (0,)},
         {"background_widths": (8,) * 33},
-        {"view_encoding": "normals"},
-        {"background": "sky"},
+        {"view_encoding": "view"},
+        {"background": "constant"},
         {"order": "depth"},
         {"sides": "back"},
         {"max_hits": 0},
@@ -170,14 +160,10 @@ def test_the_published_field_has_the_published_sizes() -> None:
         {"fine_hits": 0, "coarse_hits": 0},
         {"rays": 0},
         {"iterations": 0},
-        {"longest": 0},
-        {"view_pixels": 0},
-        {"position_scale": 0.0},
         {"rate": math.nan},
         {"feature_rate": math.inf},
-        {"final_rate": -1.0},
         {"semantic_weight": -0.1},
-        {"cache_memory": -1},
+        {"cache_memory": 1},
     ],
 )
 def test_options_that_cannot_be_are_refused(changes: dict[str, object]) -> None:

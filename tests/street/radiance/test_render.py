@@ -8,15 +8,15 @@ import torch
 
 from splatseg.errors import RangeError, ShapeError
 from splatseg.street.hits import MeshCaster
-from splatseg.street.radiance import (
-    RadianceModel,
+from splatseg.street.radiance import RadianceModel
+from splatseg.street.radiance_rendering import (
     RayValues,
+    Surface,
     depth_from_distance,
-    reference,
     render_rays,
     render_view,
 )
-from splatseg.street.radiance.samples import Surface
+from street import reference
 from street.radiance.scene import IDS, SMALL, camera, two_balls
 
 AHEAD = torch.tensor([[0.01, 0.02, 1.0]])
@@ -40,14 +40,6 @@ def test_rays_that_meet_nothing_see_the_background() -> None:
     assert torch.allclose(seen.probabilities, probabilities, atol=1e-6)
     for values in (seen.alpha, seen.distance, seen.median_distance):
         assert torch.equal(values, torch.zeros(2))
-
-
-def test_without_a_background_there_is_nothing() -> None:
-    field = model(background="none")
-    away = -AHEAD
-    seen = render_rays(field, MeshCaster(two_balls()), torch.tensor([0.0, 0, -5]), away)
-    assert float(seen.colour.abs().sum()) == 0
-    assert float(seen.probabilities.sum()) == 0
 
 
 def test_opacities_of_a_half_by_hand() -> None:
@@ -132,7 +124,7 @@ def test_colours_are_left_out_where_nobody_asks() -> None:
 
 @pytest.mark.bits
 def test_bits_do_not_depend_on_threads(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("splatseg.street.radiance.render._RAYS", 16)
+    monkeypatch.setattr("splatseg.street.radiance_rendering._RAYS", 16)
     field, caster = model(), MeshCaster(two_balls())
     before, found = torch.get_num_threads(), []
     try:

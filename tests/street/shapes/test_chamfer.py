@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.street.shapes import chamfer, sample_faces, template
+from splatseg.street.shapes import chamfer, template
+from support.shape_quality import sample_faces
 
 from . import reference
 

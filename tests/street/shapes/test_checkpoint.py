@@ -12,15 +12,8 @@ from torch import Tensor, nn
 
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.io.tensors_writing import write_tensors
-from splatseg.street.shapes import (
-    ShapeAutoEncoder,
-    ShapeConfig,
-    load_shapes,
-    new_shapes,
-    save_shapes,
-    shape_facts,
-    template,
-)
+from splatseg.street.shape_files import load_shapes, save_shapes
+from splatseg.street.shapes import ShapeAutoEncoder, ShapeConfig, new_shapes, template
 
 SMALL = ShapeConfig(code_size=4, encoder_widths=(5, 6), decoder_widths=(7,))
 WIDTH, CODE = 12, 8
@@ -144,7 +137,6 @@ def test_ours_come_back_as_they_were(tmp_path: Path) -> None:
     save_shapes(shapes, path, facts={"recipe": {"steps": 3}})
     found = load_shapes(path)
     assert found.config == SMALL
-    assert shape_facts(path) == {"recipe": {"steps": 3}}
     wanted, got = shapes.state_dict(), found.state_dict()
     assert list(wanted) == list(got)
     for name, value in got.items():
@@ -193,14 +185,6 @@ def test_files_that_are_not_there_or_none_are_refused(tmp_path: Path) -> None:
     text.write_text("weights")
     with pytest.raises(FileFormatError, match="got another kind of file"):
         load_shapes(text)
-
-
-def test_facts_are_those_of_files_of_ours(tmp_path: Path) -> None:
-    assert "recipe" in shape_facts()
-    path = tmp_path / "a.safetensors"
-    write_tensors(their_layers(CODE, 126, 2), path, metadata={})
-    with pytest.raises(FileFormatError, match="expected version 1 of splatseg.street.shapes"):
-        shape_facts(path)
 
 
 def test_weights_that_cannot_be_halved_are_refused(tmp_path: Path) -> None:

@@ -7,13 +7,8 @@ import pytest
 import torch
 
 from splatseg.errors import ShapeError
-from splatseg.street.shapes import (
-    ShapeConfig,
-    interpolate_codes,
-    new_shapes,
-    self_intersections,
-    sphere_code,
-)
+from splatseg.street.shapes import ShapeConfig, new_shapes, sphere_code
+from support.shape_quality import interpolate_codes, self_intersections
 
 
 def test_the_sphere_is_found_among_shapes_that_are_none() -> None:

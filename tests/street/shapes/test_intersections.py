@@ -5,7 +5,9 @@ import pytest
 import torch
 
 from splatseg.errors import RangeError
-from splatseg.street.shapes import intersections, self_intersections, template
+from splatseg.street.shapes import template
+from support import shape_quality as intersections
+from support.shape_quality import self_intersections
 
 from . import reference
 

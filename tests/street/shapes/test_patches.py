@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from splatseg.errors import RangeError, ShapeError
-from splatseg.street.shapes import cut_patches, primitive_scale
+from splatseg.street.shapes import primitive_scale
+from support.shape_quality import cut_patches
 
 
 def cut(points: torch.Tensor, size: float = 1.0, **rest: int) -> torch.Tensor:

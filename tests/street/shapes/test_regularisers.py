@@ -5,7 +5,8 @@ import pytest
 import torch
 
 from splatseg.errors import InputError, ShapeError
-from splatseg.street.shapes import mesh_regularisers, template
+from splatseg.street.shapes import template
+from support.shape_quality import mesh_regularisers
 
 from . import reference
 

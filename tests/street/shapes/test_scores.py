@@ -4,14 +4,8 @@ import pytest
 import torch
 
 from splatseg.errors import ShapeError
-from splatseg.street.shapes import (
-    ShapeConfig,
-    chamfer,
-    new_shapes,
-    sample_faces,
-    score_shapes,
-    template,
-)
+from splatseg.street.shapes import ShapeConfig, chamfer, new_shapes, template
+from support.shape_quality import sample_faces, score_shapes
 
 SMALL = ShapeConfig(code_size=4, encoder_widths=(8,), decoder_widths=(8,))
 

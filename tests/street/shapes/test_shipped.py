@@ -5,14 +5,14 @@ import sys
 
 import torch
 
-from splatseg.street.shapes import cut_patches, load_shapes, score_shapes
-from splatseg.street.shapes.checkpoint import SHIPPED
+from splatseg.street.shape_files import SHIPPED, load_shapes
 from splatseg.synthetic import street, surface_points, varied_room
+from support.shape_quality import cut_patches, score_shapes
 
 
 def test_it_loads_first_of_all_and_is_frozen() -> None:
     """In a fresh process: nothing was made before that it could lean on."""
-    words = "from splatseg.street.shapes import load_shapes as f; print(f().vertices.device)"
+    words = "from splatseg.street.shape_files import load_shapes as f; print(f().vertices.device)"
     done = subprocess.run([sys.executable, "-c", words], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "cpu"
     shapes = load_shapes()

@@ -6,7 +6,7 @@ import torch
 
 from splatseg.errors import InputError
 from splatseg.street.shapes import template
-from splatseg.street.shapes.template import topology
+from support.shape_quality import topology
 
 
 def test_it_is_a_closed_sphere_of_level_one() -> None:

@@ -19,18 +19,16 @@ from splatseg.io.scene_fields import (
 )
 from splatseg.io.scene_folder import work_on_scene
 from splatseg.render import BackendName
-from splatseg.street.blocks import (
-    Drive,
-    DriveField,
+from splatseg.street.block_field import DriveField
+from splatseg.street.blocks import Drive, cut_drive, frame_centres
+from splatseg.street.build import DnmpOptions
+from splatseg.street.files import (
     build_blocks,
-    cut_drive,
     drive_about,
-    frame_centres,
     goes_on,
     missing_blocks,
     open_blocks,
 )
-from splatseg.street.options import DnmpOptions
 from splatseg.tasks._moving import LeftOut
 from splatseg.tasks._observer import SILENT, Observer
 from splatseg.tasks.street._blocks import BlockParts

@@ -21,7 +21,7 @@ from splatseg.evaluate.protocols import street_class
 from splatseg.io.depths import depth_kind
 from splatseg.lift.points import points_in_sight
 from splatseg.report.street_report import PointScore
-from splatseg.street.geometry import DepthView, capture_views, field_views
+from splatseg.street.depth_views import DepthView, capture_views, field_views
 
 
 @boundary

@@ -10,7 +10,7 @@ from PIL import Image
 
 from splatseg.io.captures import read_capture
 from splatseg.io.captures.colmap import read_colmap_model
-from splatseg.pose.doctor._files import read_for_doctor
+from splatseg.pose.doctor import read_for_doctor
 from support.fuzz.targets.base import (
     GOLDEN,
     HEIGHT,
