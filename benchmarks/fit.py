@@ -20,7 +20,7 @@ from pathlib import Path
 from splatseg.core import Capture
 from splatseg.evaluate import evaluate_photographs
 from splatseg.fit import FitOptions, _run, _step
-from splatseg.fit._photographs import Photographs
+from splatseg.fit._photographs import TrainingPhotographs
 from splatseg.io.captures import read_capture
 from splatseg.lift import GaussianField
 from splatseg.render import get_backend
@@ -70,7 +70,7 @@ def main() -> None:
         module.time = type("Clocks", (), {"monotonic": clock.now, "perf_counter": clock.now})
     print(f"{platform.processor() or platform.machine()}, {threads()} threads, {isa()}, {options}")
 
-    photographs = Photographs.of(capture.train_views, options=options)
+    photographs = TrainingPhotographs.of(capture.train_views, options=options)
     marks = sorted({*arguments.marks, arguments.minutes})
     run = _run.FitRun(capture, options, get_backend("cpu"), photographs)
     before, steps, last = dict(run.stages), 0, (0, 0.0)

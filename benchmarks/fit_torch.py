@@ -28,7 +28,7 @@ from splatseg.core.sh import evaluate_sh
 from splatseg.fit import FitOptions
 from splatseg.fit._options import COLOUR_RATE, OPACITY_RATE, RATES, ROTATION_RATE
 from splatseg.fit._parameters import Parameters
-from splatseg.fit._photographs import Photographs
+from splatseg.fit._photographs import TrainingPhotographs
 from splatseg.fit._run import FitRun, one_torch_thread
 from splatseg.fit._step import l1_dssim
 from splatseg.io.captures import read_capture
@@ -264,7 +264,7 @@ def main() -> None:
     RATES["fast"] = replace(
         RATES["fast"], quarter_until=0.0, half_until=0.0, sh_degree_interval=1e-9
     )
-    photographs = Photographs(capture.train_views, longest=options.longest)
+    photographs = TrainingPhotographs(capture.train_views, longest=options.longest)
     run = FitRun(capture, options, get_backend("cpu"), photographs)
     with one_torch_thread():
         for _ in range(arguments.before):

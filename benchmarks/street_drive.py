@@ -40,9 +40,9 @@ from splatseg.io.evidence import open_evidence
 from splatseg.raycast import RayCaster
 from splatseg.street.block_field import DriveField, DriveScans, block_capture
 from splatseg.street.blocks import (
-    Drive,
     DriveBlock,
     DriveBlockOptions,
+    DriveBlocks,
     cut_drive,
     frame_centres,
 )
@@ -230,7 +230,9 @@ class Recorder:
 class Maker:
     """Makes the field of a block: what `splatseg street` does of a drive, in small."""
 
-    def __init__(self, drive: Drive, capture: Capture, scans: DriveScans, road: Recorder) -> None:
+    def __init__(
+        self, drive: DriveBlocks, capture: Capture, scans: DriveScans, road: Recorder
+    ) -> None:
         self.drive, self.capture, self.scans, self.recorder = drive, capture, scans, road
         self.shapes: ShapeAutoEncoder = load_shapes()
         self.sphere = sphere_code(self.shapes)

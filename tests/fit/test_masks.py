@@ -12,7 +12,7 @@ from splatseg.core import Camera, View
 from splatseg.errors import FileFormatError, InputError
 from splatseg.evaluate import evaluate_photographs
 from splatseg.fit import FitOptions, fit
-from splatseg.fit._photographs import Photographs
+from splatseg.fit._photographs import TrainingPhotographs
 from splatseg.io.images import load_alpha, save_png
 from splatseg.lift import GaussianField
 from splatseg.render import render
@@ -68,7 +68,7 @@ def test_examples_hold_colour_times_alpha(tmp_path: Path, mode: str) -> None:
         view = _masked(_view(tmp_path, colour), opaque)
     else:
         view = _view(tmp_path, np.concatenate((colour, opaque[..., None]), axis=2))
-    photographs = Photographs([view], longest=100, masks="alpha")
+    photographs = TrainingPhotographs([view], longest=100, masks="alpha")
     example = photographs.example(0)
     assert example.mask is None
     assert torch.allclose(example.alpha * 255, torch.tensor([[0.0, 51, 255, 255]] * 2))
@@ -82,10 +82,10 @@ def test_examples_hold_colour_times_alpha(tmp_path: Path, mode: str) -> None:
 def test_what_masks_mean_is_an_option(tmp_path: Path) -> None:
     mask = np.array([[0, 255]], np.uint8)
     view = _masked(_view(tmp_path, np.full((1, 2, 3), 200, np.uint8)), mask)
-    ignored = Photographs([view], longest=100, masks="ignore").example(0)
+    ignored = TrainingPhotographs([view], longest=100, masks="ignore").example(0)
     assert ignored.mask.tolist() == [[False, True]]
     assert ignored.alpha is None
-    plain = Photographs([view], longest=100, masks="off").example(0)
+    plain = TrainingPhotographs([view], longest=100, masks="off").example(0)
     assert plain.mask is None
     assert plain.alpha is None
     assert torch.allclose(plain.photograph * 255, torch.tensor(200.0))
@@ -99,7 +99,7 @@ def test_alpha_behind_a_lens_goes_where_the_pixels_go(tmp_path: Path) -> None:
     view = _view(
         tmp_path, np.full((20, 24, 3), 100, np.uint8), model="opencv", distortion=(0.2, 0.05)
     )
-    example = Photographs([_masked(view, opaque)], longest=100, masks="alpha").example(0)
+    example = TrainingPhotographs([_masked(view, opaque)], longest=100, masks="alpha").example(0)
     assert example.mask is not None
     assert not bool(example.mask.all()), "the pinhole image is larger than the photograph"
     assert torch.allclose(

@@ -7,7 +7,7 @@ import torch
 
 from splatseg.core import Camera, View
 from splatseg.fit import reduction_note
-from splatseg.fit._photographs import Photographs
+from splatseg.fit._photographs import TrainingPhotographs
 from splatseg.io.images import save_png
 
 
@@ -26,7 +26,7 @@ def _pixels(rng, height: int, width: int) -> torch.Tensor:
 def test_full_size_is_the_photograph(tmp_path: Path, rng) -> None:
     pixels = _pixels(rng, 6, 9)
     view = _view(tmp_path, pixels)
-    example = Photographs([view], longest=1600).example(0)
+    example = TrainingPhotographs([view], longest=1600).example(0)
     assert torch.equal(example.photograph, pixels.float() / 255)
     assert example.mask is None
     assert (example.camera.width, example.camera.height) == (9, 6)
@@ -35,7 +35,7 @@ def test_full_size_is_the_photograph(tmp_path: Path, rng) -> None:
 def test_blocks_are_means_and_rays_stay(tmp_path: Path, rng) -> None:
     """A point seen at the centre of a block is seen at the centre of the pixel it becomes."""
     pixels = _pixels(rng, 13, 18)
-    photographs = Photographs([_view(tmp_path, pixels)], longest=1600)
+    photographs = TrainingPhotographs([_view(tmp_path, pixels)], longest=1600)
     full, small = photographs.camera(0), photographs.example(0, reduction=4)
     assert small.photograph.shape == (3, 4, 3)
     expected = pixels[4:8, 8:12].float().mean(dim=(0, 1)) / 255
@@ -50,7 +50,7 @@ def test_a_block_counts_if_all_its_pixels_do(tmp_path: Path, rng) -> None:
     mask = torch.full((8, 8), 255, dtype=torch.uint8)
     mask[1, 6] = 0
     save_png(mask, tmp_path / "mask.png")
-    photographs = Photographs([replace(view, mask=tmp_path / "mask.png")], longest=1600)
+    photographs = TrainingPhotographs([replace(view, mask=tmp_path / "mask.png")], longest=1600)
     full, small = photographs.example(0), photographs.example(0, reduction=4)
     assert full.mask is not None
     assert small.mask is not None
@@ -63,7 +63,7 @@ def test_a_lens_is_undistorted_with_its_corners(tmp_path: Path, rng) -> None:
     """A grey photograph stays grey where it is real; outside it nothing counts."""
     pixels = torch.full((30, 40, 3), 120, dtype=torch.uint8)
     view = _view(tmp_path, pixels, model="opencv", distortion=(-0.2,))
-    example = Photographs([view], longest=1600).example(0)
+    example = TrainingPhotographs([view], longest=1600).example(0)
     assert example.camera.is_pinhole
     assert example.camera.width > 40
     assert example.mask is not None
@@ -81,7 +81,7 @@ def test_undistorted_pixels_that_mix_masked_ones_do_not_count(tmp_path: Path) ->
     view = _view(tmp_path, pixels, model="opencv", distortion=(-0.2,))
     save_png(mask, tmp_path / "mask.png")
     masked = replace(view, mask=tmp_path / "mask.png")
-    example = Photographs([masked], longest=1600).example(0)
+    example = TrainingPhotographs([masked], longest=1600).example(0)
     assert example.mask is not None
     assert 0.3 < float(example.mask.float().mean()) < 0.7
     assert bool((example.photograph[example.mask] == 120 / 255).all())
@@ -94,14 +94,14 @@ def test_large_photographs_are_reduced_and_it_is_said(tmp_path: Path, rng) -> No
     assert note is not None
     assert "2 of 2 photographs are reduced to a longest side of 40" in note
     assert "80x60 to 40x30" in note
-    example = Photographs([view], longest=40).example(0)
+    example = TrainingPhotographs([view], longest=40).example(0)
     assert example.photograph.shape == (30, 40, 3)
     assert example.camera.fx == 20
 
 
 def test_every_pixel_is_read_once(tmp_path: Path, rng) -> None:
     view = _view(tmp_path, _pixels(rng, 6, 9))
-    photographs = Photographs([view], longest=1600)
+    photographs = TrainingPhotographs([view], longest=1600)
     first = photographs.example(0)
     (tmp_path / "photo.png").unlink()
     assert torch.equal(photographs.example(0).photograph, first.photograph)

@@ -11,7 +11,7 @@ from splatseg.core import Camera, Similarity
 from splatseg.evaluate import evaluate_photographs
 from splatseg.fit import FitOptions, _views, fit
 from splatseg.fit._views import (
-    Poses,
+    PoseRefinement,
     aligning_similarity,
     centres_of,
     exponential,
@@ -87,7 +87,7 @@ def test_a_step_goes_down_the_slope_by_the_rate(rng: np.random.Generator) -> Non
         torch.from_numpy(rng.uniform(1, 47, (200, 2))), torch.from_numpy(rng.uniform(2, 4, 200))
     )
     for scale in (1e-6, 1.0, 1e6):
-        poses = Poses([camera], points=points)
+        poses = PoseRefinement([camera], points=points)
         leaf = poses.leaf(0, camera)
         goal = torch.from_numpy(np.random.default_rng(0).normal(size=(4, 4)))
         (scale * (leaf.cam_from_world * goal)[:3].sum()).backward()
@@ -110,7 +110,7 @@ def test_alignment_takes_a_common_motion_out(rng: np.random.Generator) -> None:
     )
     back = aligning_similarity(given, refined)
     assert torch.allclose(back.matrix, refined_from_given.inverse().matrix, atol=1e-9)
-    poses = Poses([_camera(pose) for pose in given], points=torch.zeros(0, 3))
+    poses = PoseRefinement([_camera(pose) for pose in given], points=torch.zeros(0, 3))
     poses.restore({**poses.state(), "poses": refined})
     assert torch.allclose(poses.aligned()[1], given, atol=1e-9)
     assert poses.shift().degrees_max < 1e-6
@@ -140,7 +140,7 @@ def test_the_shift_by_hand() -> None:
     angle = math.radians(2)
     turned = exponential(torch.tensor([0, angle, 0, 0, 0, 0], dtype=torch.float64)) @ far
     turned[:3, 3] = -turned[:3, :3] @ centres_of(far[None])[0]
-    poses = Poses([_camera(eye), _camera(far)], points=torch.zeros(0, 3))
+    poses = PoseRefinement([_camera(eye), _camera(far)], points=torch.zeros(0, 3))
     poses.restore({**poses.state(), "poses": torch.stack((eye, turned))})
     shift = poses.shift()
     assert shift.degrees_max == pytest.approx(4 / 3, rel=1e-3)
@@ -150,10 +150,10 @@ def test_the_shift_by_hand() -> None:
 def test_a_restored_one_goes_on_as_if_nothing_had_been(rng: np.random.Generator) -> None:
     cameras = [_camera(_pose(rng)) for _ in range(2)]
     points = torch.from_numpy(rng.normal(size=(50, 3)) + np.array([0.0, 0.0, 3.0]))
-    one, other = (Poses(cameras, points=points) for _ in range(2))
+    one, other = (PoseRefinement(cameras, points=points) for _ in range(2))
     gradients = torch.from_numpy(rng.normal(size=(4, 4, 4)))
 
-    def step(poses: Poses, i: int) -> None:
+    def step(poses: PoseRefinement, i: int) -> None:
         (poses.leaf(i % 2, cameras[0]).cam_from_world * gradients[i]).sum().backward()
         poses.update(i % 2, progress=0.1)
 

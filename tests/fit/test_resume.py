@@ -103,10 +103,10 @@ def test_stops_change_no_bit(capture: Capture, path: Path, options: FitOptions) 
 
 def test_everything_that_a_step_changes_is_in_the_state(capture: Capture, path: Path) -> None:
     """Nothing differs between a run and its copy, now and ten steps later."""
-    from splatseg.fit._photographs import Photographs
+    from splatseg.fit._photographs import TrainingPhotographs
     from splatseg.render import get_backend
 
-    photographs = Photographs(capture.train_views, longest=OPTIONS.longest)
+    photographs = TrainingPhotographs(capture.train_views, longest=OPTIONS.longest)
     backend = get_backend("cpu")
     run = FitRun(capture, OPTIONS, backend, photographs)
     for _ in range(25):
@@ -396,7 +396,7 @@ def test_a_published_fit_of_version_0_1_goes_on(capture: Capture, path: Path) ->
     gone = {"rates": "absent", "position_rate": 1.6e-4, "final_rate": 1.0, "quarter_until": 0.0}
     defaults = {"rates": "absent", "position_rate": 8e-4, "final_rate": 0.2, "quarter_until": 0.02}
     _recorded_otherwise(path, options=gone, defaults=defaults)
-    with pytest.raises(InputError, match="rates published instead of fast"):
+    with pytest.raises(InputError, match='rates "published" instead of "fast"'):
         fit(capture, options=OPTIONS, checkpoints=checkpoints)
     assert fit(capture, options=options, checkpoints=checkpoints).steps == 60
 

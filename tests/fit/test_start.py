@@ -10,7 +10,7 @@ from splatseg.core import Camera, Capture
 from splatseg.errors import InputError
 from splatseg.evaluate import evaluate_photographs
 from splatseg.fit import FitOptions, fit
-from splatseg.fit._photographs import Photographs
+from splatseg.fit._photographs import TrainingPhotographs
 from splatseg.fit._start import depth_range_of_cameras, random_points, with_start_points
 from splatseg.io.images import save_png
 from splatseg.lift import GaussianField
@@ -27,7 +27,7 @@ def _looking_along_z(x: float, y: float = 0.0, turn: float = 0.0) -> Camera:
     return Camera(width=40, height=30, fx=40.0, fy=40.0, cx=20.0, cy=15.0, cam_from_world=pose)
 
 
-def _drawn(photographs: Photographs, count: int, seed: int = 0) -> torch.Tensor:
+def _drawn(photographs: TrainingPhotographs, count: int, seed: int = 0) -> torch.Tensor:
     generator = torch.Generator().manual_seed(seed)
     return random_points(photographs, count=count, generator=generator).points
 
@@ -69,7 +69,7 @@ def test_cameras_that_look_elsewhere_have_no_ball() -> None:
 
 def test_points_lie_on_what_is_photographed(capture: Capture) -> None:
     """Most pixels show blobs within 1.3 of the centre; others show black, which is ambiguous."""
-    photographs = Photographs(capture.train_views, longest=1600)
+    photographs = TrainingPhotographs(capture.train_views, longest=1600)
     generator = torch.Generator().manual_seed(1)
     cloud = random_points(photographs, count=2000, generator=generator)
     assert len(cloud) == 2000
@@ -89,7 +89,7 @@ def test_points_lie_on_what_is_photographed(capture: Capture) -> None:
 def test_points_have_the_colour_of_their_pixel(capture: Capture) -> None:
     """Each point is seen by the view it was drawn from in a pixel of its colour."""
     views = capture.train_views[:1]
-    photographs = Photographs(views, longest=1600)
+    photographs = TrainingPhotographs(views, longest=1600)
     cloud = random_points(photographs, count=300, generator=torch.Generator().manual_seed(1))
     assert cloud.colours is not None
     pixels, depth = views[0].camera.project(cloud.points.double())
@@ -100,7 +100,7 @@ def test_points_have_the_colour_of_their_pixel(capture: Capture) -> None:
 
 
 def test_same_seed_same_points(capture: Capture) -> None:
-    photographs = Photographs(capture.train_views, longest=1600)
+    photographs = TrainingPhotographs(capture.train_views, longest=1600)
     assert torch.equal(_drawn(photographs, 100), _drawn(photographs, 100))
     assert not torch.equal(_drawn(photographs, 100), _drawn(photographs, 100, seed=1))
 
@@ -111,13 +111,13 @@ def test_masked_pixels_start_nothing(capture: Capture, tmp_path: Path) -> None:
     mask[:, 28] = 255
     save_png(mask, tmp_path / "mask.png")
     views = tuple(replace(view, mask=tmp_path / "mask.png") for view in capture.train_views)
-    photographs = Photographs(views, longest=1600)
+    photographs = TrainingPhotographs(views, longest=1600)
     points = _drawn(photographs, 110).reshape(len(views), -1, 3)
     for view, own in zip(views, points, strict=True):
         pixels, _ = view.camera.project(own.double())
         assert bool((pixels[:, 0].floor() == 28).all())
     save_png(torch.zeros(48, 56, dtype=torch.uint8), tmp_path / "mask.png")
-    assert len(_drawn(Photographs(views, longest=1600), 110)) == 0
+    assert len(_drawn(TrainingPhotographs(views, longest=1600), 110)) == 0
 
 
 def test_a_fit_starts_without_points(capture: Capture) -> None:
@@ -137,7 +137,7 @@ def test_a_fit_starts_without_points(capture: Capture) -> None:
 
 
 def test_the_capture_keeps_its_points(capture: Capture) -> None:
-    photographs = Photographs(capture.train_views, longest=1600)
+    photographs = TrainingPhotographs(capture.train_views, longest=1600)
     generator = torch.Generator().manual_seed(0)
 
     def points(start: str, **options: object) -> int:
@@ -153,7 +153,7 @@ def test_the_capture_keeps_its_points(capture: Capture) -> None:
 
 def test_few_points_are_joined_by_places_where_photographs_agree(capture: Capture) -> None:
     """The capture's points come first, as they were; those beside them lie between their depths."""
-    photographs = Photographs(capture.train_views, longest=1600)
+    photographs = TrainingPhotographs(capture.train_views, longest=1600)
 
     def filled(**options: object) -> Capture:
         generator = torch.Generator().manual_seed(0)
@@ -195,7 +195,7 @@ def test_few_points_are_joined_by_places_where_photographs_agree(capture: Captur
 
 def test_places_that_views_disagree_about_are_left_out(capture: Capture) -> None:
     """Photographs that have nothing in common agree nowhere."""
-    photographs = Photographs(capture.train_views, longest=1600)
+    photographs = TrainingPhotographs(capture.train_views, longest=1600)
     generator = torch.Generator().manual_seed(0)
     none = random_points(photographs, count=500, generator=generator, max_difference=0.0)
     assert len(none) == 0

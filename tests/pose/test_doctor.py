@@ -10,7 +10,7 @@ import torch
 
 from splatseg.core import Camera, Capture, PointCloud, Similarity
 from splatseg.io.captures import read_capture
-from splatseg.pose.doctor import DoctorOptions, Matches, diagnose, match_views
+from splatseg.pose.doctor import DoctorOptions, ViewMatches, diagnose, match_views
 
 OPTIONS = DoctorOptions(max_views=15)
 FLIP = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))
@@ -90,7 +90,7 @@ class Matched:
     """A healthy capture, and what its photographs have in common, which no fault changes."""
 
     capture: Capture
-    matches: Matches
+    matches: ViewMatches
 
 
 def matched(capture: Capture) -> Matched:

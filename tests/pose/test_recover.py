@@ -227,5 +227,5 @@ def test_a_damaged_report_of_poses_names_its_file(tmp_path, report) -> None:
     assert load_pose_report(tmp_path, made_of="y") is None
     damaged = {**asdict(sound), **report} if report else report
     file.write_text(json.dumps({**content, "report": damaged}))
-    with pytest.raises(FileFormatError, match=r"poses\.json: expected the report of poses"):
+    with pytest.raises(FileFormatError, match=r"poses\.json: report"):
         load_pose_report(tmp_path)

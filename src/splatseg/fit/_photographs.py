@@ -38,7 +38,7 @@ class Example:
     """Opacity of each pixel, [0, 1]; None is opaque everywhere."""
 
 
-class Photographs:
+class TrainingPhotographs:
     """Training views by index. Pixels are read at first use.
 
     Photographs with distortion are resampled into ``camera.undistorted()``; pixels outside the
@@ -47,7 +47,7 @@ class Photographs:
     to be blended over a colour other than white.
 
     Example:
-        photographs = Photographs(capture.train_views, longest=1600)
+        photographs = TrainingPhotographs(capture.train_views, longest=1600)
         example = photographs.example(0, reduction=2)
     """
 

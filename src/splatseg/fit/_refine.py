@@ -19,7 +19,7 @@ from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError
 from splatseg.fit._options import FitOptions
 from splatseg.fit._parameters import Parameters, UpdateSettings, final_gaussians, rates_at
-from splatseg.fit._photographs import Photographs
+from splatseg.fit._photographs import TrainingPhotographs
 from splatseg.fit._start import scene_extent
 from splatseg.fit._step import ExtraLoss, StepSettings, TrainingStep
 from splatseg.fit._views import Exposure, ViewModules
@@ -96,7 +96,7 @@ class Refinement:
             name="refine",
             options=options,
             backend=renderer,
-            photographs=Photographs.of(views, options=options),
+            photographs=TrainingPhotographs.of(views, options=options),
             views=self._views,
             generator=self._generator,
         )
@@ -338,7 +338,7 @@ class MaskedView:
 
 
 def without_floaters(
-    gaussians: Gaussians, photographs: Photographs, views: Sequence[View], *, backend: str
+    gaussians: Gaussians, photographs: TrainingPhotographs, views: Sequence[View], *, backend: str
 ) -> Gaussians:
     """The Gaussians that the photographs need; see `needed`.
 

@@ -32,7 +32,7 @@ from splatseg.fit._parameters import (
     rates_at,
     reduction_at,
 )
-from splatseg.fit._photographs import Photographs
+from splatseg.fit._photographs import TrainingPhotographs
 from splatseg.fit._refine import without_floaters
 from splatseg.fit._start import initial_parameters, scene_extent, scene_size, with_start_points
 from splatseg.fit._step import Loss, StepGradients, StepSettings, TrainingStep
@@ -134,7 +134,7 @@ def fit(
     result depends on the seed alone, not on the number of threads or the speed of the machine.
 
     Args:
-        capture: Photographs with cameras and start points.
+        capture: TrainingPhotographs with cameras and start points.
         options: Length, size and learning rates.
         backend: Name of the renderer: ``auto``, ``cpu``, ``cuda`` or ``reference``.
         progress: Called after every step. A `KeyboardInterrupt` raised by it, Ctrl-C or SIGTERM
@@ -161,7 +161,7 @@ def fit(
     if checkpoints is not None:
         identity = fit_identity(capture, views, options=options, backend=renderer.name)
         clock = CheckpointClock(checkpoints, identity=identity)
-    photographs = Photographs.of(views, options=options)
+    photographs = TrainingPhotographs.of(views, options=options)
     saved = None if clock is None else clock.saved()
     with one_torch_thread():
         run = FitRun(capture, options, renderer, photographs, saved=saved)
@@ -206,7 +206,7 @@ class FitRun:
         capture: Capture,
         options: FitOptions,
         backend: Backend,
-        photographs: Photographs,
+        photographs: TrainingPhotographs,
         *,
         saved: FitState | None = None,
     ) -> None:

@@ -19,7 +19,7 @@ from splatseg.core.sh import SH_C0
 from splatseg.errors import InputError
 from splatseg.fit._options import START_OPACITY, FitOptions
 from splatseg.fit._parameters import Parameters
-from splatseg.fit._photographs import Example, Photographs
+from splatseg.fit._photographs import Example, TrainingPhotographs
 from splatseg.neighbours import NeighbourIndex
 
 COUNT = 30_000
@@ -63,7 +63,7 @@ class DepthRange:
 
 def with_start_points(
     capture: Capture,
-    photographs: Photographs,
+    photographs: TrainingPhotographs,
     *,
     options: FitOptions,
     generator: torch.Generator,
@@ -108,7 +108,7 @@ def random_point_count(capture: Capture, options: FitOptions) -> int:
     return max(0, min(COUNT, int(_MAX_GAUSSIANS_SHARE * options.max_gaussians)) - own)
 
 
-def _depth_range_of_points(points: PointCloud, photographs: Photographs) -> DepthRange:
+def _depth_range_of_points(points: PointCloud, photographs: TrainingPhotographs) -> DepthRange:
     """Depths of points in the views, with a margin; that of the cameras if there are few."""
     cameras = [photographs.camera(i) for i in range(len(photographs))]
     found: list[Tensor] = []
@@ -168,7 +168,7 @@ def depth_range_of_cameras(cameras: list[Camera]) -> DepthRange:
 
 
 def random_points(
-    photographs: Photographs,
+    photographs: TrainingPhotographs,
     *,
     count: int,
     generator: torch.Generator,
@@ -229,7 +229,7 @@ def _is_in_view(camera: Camera, point: Tensor) -> bool:
     return float(depth) > 0 and 0 <= x <= camera.width and 0 <= y <= camera.height
 
 
-def _reduced(photographs: Photographs, index: int) -> Example:
+def _reduced(photographs: TrainingPhotographs, index: int) -> Example:
     camera = photographs.camera(index)
     reduction = max(1, round(max(camera.width, camera.height) / _MAX_SIDE))
     reduction = min(reduction, camera.width, camera.height)

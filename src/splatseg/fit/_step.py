@@ -25,7 +25,7 @@ from splatseg.fit._parameters import (
     rows_in_view,
     update_rows,
 )
-from splatseg.fit._photographs import Example, Photographs
+from splatseg.fit._photographs import Example, TrainingPhotographs
 from splatseg.fit._views import ViewModules
 from splatseg.fit.depth import DepthLoss
 from splatseg.render import Backend, Rendered, RenderOptions
@@ -120,7 +120,7 @@ class TrainingStep:
         name: str,
         options: FitOptions,
         backend: Backend,
-        photographs: Photographs,
+        photographs: TrainingPhotographs,
         views: ViewModules,
         generator: torch.Generator,
     ) -> None:

@@ -31,7 +31,7 @@ class PoseShift:
     """Distance of a camera's centre, scene units."""
 
 
-class Poses:
+class PoseRefinement:
     r"""Poses of the training views, each updated by a twist in its own camera axes.
 
     .. math:: T \leftarrow \exp \begin{pmatrix} [\omega]_\times & v \\ 0 & 0 \end{pmatrix} T
@@ -233,7 +233,7 @@ class ViewModules:
 
     exposures: Exposures | None
     depths: DepthMaps | None
-    poses: Poses | None
+    poses: PoseRefinement | None
 
     @classmethod
     def of(
@@ -260,7 +260,7 @@ class ViewModules:
         poses = None
         if options.refine_poses:
             surface_points = torch.zeros(0, 3) if points is None else points
-            poses = Poses([view.camera for view in views], points=surface_points)
+            poses = PoseRefinement([view.camera for view in views], points=surface_points)
         learned = None
         if options.exposure:
             known = exposures or {}

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from splatseg.core import Camera, PointCloud
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError
-from splatseg.pose._doctor_matches import Matches, Rays, Residuals, rays_of, residuals
+from splatseg.pose._doctor_matches import Rays, Residuals, ViewMatches, rays_of, residuals
 
 Array = NDArray[np.float64]
 
@@ -186,7 +186,7 @@ class Scored:
 class MatchEvidence:
     """Matches with the cameras as they were given, ready to try corrections on."""
 
-    matches: Matches
+    matches: ViewMatches
     cameras: tuple[Camera, ...]
     poses: Array
     """(views, 4, 4) cam_from_world."""
@@ -255,7 +255,7 @@ class MatchEvidence:
         return planes
 
 
-def match_evidence(matches: Matches, cameras: Sequence[Camera]) -> MatchEvidence:
+def match_evidence(matches: ViewMatches, cameras: Sequence[Camera]) -> MatchEvidence:
     """Matches and the cameras they are to be held against."""
     return MatchEvidence(
         matches=matches,
@@ -293,7 +293,7 @@ def search_cameras(evidence: MatchEvidence, *, world_axes: Array | None) -> list
     and scored on all.
 
     Args:
-        evidence: Matches and cameras.
+        evidence: ViewMatches and cameras.
         world_axes: What an inverted pose is multiplied with, see `CameraCorrection`.
     """
     few = evidence.subset(_SUBSET)
@@ -375,7 +375,7 @@ def estimate_intrinsics(
     None where matches are too few, or nothing near the cameras fits them.
 
     Args:
-        evidence: Matches and cameras.
+        evidence: ViewMatches and cameras.
         correction: What was found wrong before.
     """
     pairs = len(evidence.matches.views)

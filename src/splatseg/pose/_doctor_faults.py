@@ -37,6 +37,16 @@ class Fault:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Findings:
+    """What has been found so far: each part of an examination adds to it; see `Diagnosis`."""
+
+    faults: list[Fault] = field(default_factory=list[Fault])
+    doubts: list[str] = field(default_factory=list[str])
+    unchecked: list[str] = field(default_factory=list[str])
+    figures: dict[str, Any] = field(default_factory=dict[str, Any])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Diagnosis:
     """The result of `diagnose`."""
 
@@ -140,54 +150,60 @@ _OPENGL_FILES = ("nerfstudio", "blender", "llff")
 
 def camera_faults(correction: CameraCorrection, capture: Capture) -> list[Fault]:
     """The faults that a correction of all cameras stands for."""
-    found: list[Fault] = []
-    axes, inverted = correction.axes, correction.inverted
-    if inverted:
-        found.append(_inverted(capture))
-        if capture.format in _OPENGL_FILES:
-            # The inverse of an OpenGL pose needs the half turn again; without it the matrix
-            # already had OpenCV axes.
-            axes = axes @ FLIP
-    if not is_identity(axes):
-        found.append(_axes(axes))
-    if correction.swapped:
-        found.append(
-            Fault(
-                name="swapped-intrinsics",
-                sentence="fx and fy, cx and cy are exchanged: the intrinsics belong to the "
-                "photographs turned by a quarter.",
-                remedy="fx is exchanged with fy, and cx with cy.",
-            )
-        )
-    if correction.scale != 1:
-        ratio = 1 / correction.scale
-        found.append(
-            Fault(
-                name="scaled-intrinsics",
-                sentence=f"The intrinsics belong to images {ratio:g} times the size of the "
-                "photographs.",
-                remedy=f"fx, fy, cx and cy are multiplied by {correction.scale:g}.",
-            )
-        )
-    if abs(correction.focal - 1) > 1e-9:
-        found.append(
-            Fault(
-                name="focal-length",
-                sentence=f"The focal length is {1 / correction.focal:.4g} times what the "
-                "photographs show.",
-                remedy=f"fx and fy are multiplied by {correction.focal:.5g}.",
-            )
-        )
-    if correction.centred:
-        found.append(
-            Fault(
-                name="principal-point",
-                sentence="The principal point is far from the middle of the photographs, and the "
-                "middle fits them.",
-                remedy="cx and cy become the middle of the photographs.",
-            )
-        )
-    return found
+    axes = correction.axes
+    opengl = capture.format in _OPENGL_FILES
+    if correction.inverted and opengl:
+        # The inverse of an OpenGL pose needs the half turn again; without it the matrix
+        # already had OpenCV axes.
+        axes = axes @ FLIP
+    kinds = ("world-to-camera", "camera-to-world")
+    has, wants = kinds if opengl else reversed(kinds)
+    table = (
+        (
+            correction.inverted,
+            "inverted-poses",
+            f"The poses are {has} matrices where {wants} ones are expected.",
+            "The matrices are inverted.",
+        ),
+        (
+            not is_identity(axes),
+            "camera-axes",
+            f"The camera axes are mixed up: {_axes(axes)}.",
+            "The camera axes of all poses are exchanged.",
+        ),
+        (
+            correction.swapped,
+            "swapped-intrinsics",
+            "fx and fy, cx and cy are exchanged: the intrinsics belong to the photographs turned "
+            "by a quarter.",
+            "fx is exchanged with fy, and cx with cy.",
+        ),
+        (
+            correction.scale != 1,
+            "scaled-intrinsics",
+            f"The intrinsics belong to images {1 / correction.scale:g} times the size of the "
+            "photographs.",
+            f"fx, fy, cx and cy are multiplied by {correction.scale:g}.",
+        ),
+        (
+            abs(correction.focal - 1) > 1e-9,
+            "focal-length",
+            f"The focal length is {1 / correction.focal:.4g} times what the photographs show.",
+            f"fx and fy are multiplied by {correction.focal:.5g}.",
+        ),
+        (
+            correction.centred,
+            "principal-point",
+            "The principal point is far from the middle of the photographs, and the middle fits "
+            "them.",
+            "cx and cy become the middle of the photographs.",
+        ),
+    )
+    return [
+        Fault(name=name, sentence=sentence, remedy=remedy)
+        for applies, name, sentence, remedy in table
+        if applies
+    ]
 
 
 def shift_fault(
@@ -271,30 +287,12 @@ def describe_move(correction: PointCorrection) -> str:
     return ", ".join(parts) or "nothing"
 
 
-def _inverted(capture: Capture) -> Fault:
-    if capture.format in _OPENGL_FILES:
-        has, wants = "world-to-camera", "camera-to-world"
-    else:
-        has, wants = "camera-to-world", "world-to-camera"
-    return Fault(
-        name="inverted-poses",
-        sentence=f"The poses are {has} matrices where {wants} ones are expected.",
-        remedy="The matrices are inverted.",
-    )
-
-
-def _axes(axes: NDArray[np.float64]) -> Fault:
+def _axes(axes: NDArray[np.float64]) -> str:
     if np.allclose(axes, FLIP):
-        sentence = (
-            "The camera axes are mixed up: the poses have y and z the other way round (OpenGL "
-            "for OpenCV, or OpenCV for OpenGL)."
+        return (
+            "the poses have y and z the other way round (OpenGL for OpenCV, or OpenCV for OpenGL)"
         )
-    else:
-        shown = ", ".join(_row(row) for row in axes)
-        sentence = f"The camera axes are mixed up: right, down and forward are ({shown})."
-    return Fault(
-        name="camera-axes", sentence=sentence, remedy="The camera axes of all poses are exchanged."
-    )
+    return f"right, down and forward are ({', '.join(_row(row) for row in axes)})"
 
 
 def _row(row: NDArray[np.float64]) -> str:

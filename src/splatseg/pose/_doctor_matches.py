@@ -25,7 +25,7 @@ _MIN_MOTION = 0.015
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Matches:
+class ViewMatches:
     """Pixels of two views that show the same place, verified pair by pair.
 
     Verified means that some fundamental matrix explains them (7 parameters a pair, fitted to the
@@ -86,7 +86,7 @@ def match_views(
     *,
     max_views: int,
     longest: int,
-) -> Matches:
+) -> ViewMatches:
     """Match features (SIFT) between neighbouring photographs.
 
     Args:
@@ -111,7 +111,7 @@ def match_views(
         pairs.append((i, j))
         kept.append(pixels)
     counts = [len(pixels) for pixels in kept]
-    return Matches(
+    return ViewMatches(
         pair=np.repeat(np.arange(len(pairs)), counts),
         views=np.array(pairs, dtype=np.int64).reshape(-1, 2),
         pixels=np.concatenate(kept) if kept else np.zeros((0, 2, 2)),
@@ -288,7 +288,7 @@ def _triangulated(first: Array, second: Array, offset: Array) -> tuple[Array, Ar
     return depths, np.arccos(cosine)
 
 
-def rays_of(matches: Matches, planes: Array, focal: Array, longest: Array) -> Rays:
+def rays_of(matches: ViewMatches, planes: Array, focal: Array, longest: Array) -> Rays:
     """Rays of matches from plane coordinates (n, 2, 2) and per-view focal lengths (views,)."""
     ones = np.ones((len(matches), 1))
     views = matches.views[matches.pair]

@@ -1,7 +1,7 @@
 """Start points and the up axis: how well they agree with cameras, and in which frame they would."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from splatseg.pose._doctor_faults import (
     CERTAIN,
     WRONG,
     Fault,
+    Findings,
     axis_name,
     degrees_between,
     describe_move,
@@ -39,7 +40,7 @@ _PLACES = 2000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PointScore:
+class PointAgreement:
     """What the photographs say of start points under some cameras."""
 
     colour: float | None
@@ -60,7 +61,7 @@ class PointScore:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Photographs:
+class ReducedPhotographs:
     """Reduced photographs of some views, kept in memory."""
 
     views: tuple[int, ...]
@@ -68,12 +69,14 @@ class Photographs:
     """(3, h, w) float32 in [0, 1]."""
 
 
-def load_photographs(views: Sequence[View], chosen: Sequence[int], *, longest: int) -> Photographs:
+def load_photographs(
+    views: Sequence[View], chosen: Sequence[int], *, longest: int
+) -> ReducedPhotographs:
     """The photographs of chosen views, reduced (area-weighted)."""
     images = tuple(
         load_image(views[i], longest=longest).permute(2, 0, 1).float() / 255 for i in chosen
     )
-    return Photographs(views=tuple(chosen), images=images)
+    return ReducedPhotographs(views=tuple(chosen), images=images)
 
 
 def sample_points(cloud: PointCloud, max_points: int, *, seed: int = 0) -> PointCloud:
@@ -87,7 +90,7 @@ def sample_points(cloud: PointCloud, max_points: int, *, seed: int = 0) -> Point
 
 
 def colour_score(
-    photographs: Photographs, cameras: Sequence[Camera], cloud: PointCloud, *, seed: int = 0
+    photographs: ReducedPhotographs, cameras: Sequence[Camera], cloud: PointCloud, *, seed: int = 0
 ) -> tuple[float | None, float]:
     """Agreement of colours beyond chance, and the share of points that two views or more see.
 
@@ -163,7 +166,7 @@ _ROUNDS = 12
 class PointEvidence:
     """All that start points are held against."""
 
-    photographs: Photographs
+    photographs: ReducedPhotographs
     cameras: tuple[Camera, ...]
     """Of all views, corrected."""
 
@@ -173,12 +176,12 @@ class PointEvidence:
     depth: Array
     """(n,) their depths."""
 
-    def score(self, cloud: PointCloud, correction: PointCorrection) -> PointScore:
+    def score(self, cloud: PointCloud, correction: PointCorrection) -> PointAgreement:
         """How well points agree after a correction."""
         moved = correction.apply(cloud)
         colour, seen = colour_score(self.photographs, self.cameras, sample_points(moved, 3000))
         position = position_score(self.triangulated, self.depth, moved.points.double().numpy())
-        return PointScore(colour=colour, position=position, seen=seen)
+        return PointAgreement(colour=colour, position=position, seen=seen)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -186,7 +189,7 @@ class ScoredPoints:
     """A correction of points and what it gives."""
 
     correction: PointCorrection
-    score: PointScore
+    score: PointAgreement
 
 
 def unmoved() -> PointCorrection:
@@ -198,7 +201,7 @@ def search_points(
     evidence: PointEvidence,
     cloud: PointCloud,
     *,
-    fits: Callable[[PointScore], bool],
+    fits: Callable[[PointAgreement], bool],
     declared: Sequence[PointCorrection] = (),
 ) -> ScoredPoints:
     """The correction under which start points agree best with cameras and photographs.
@@ -290,7 +293,7 @@ def _by_colour(
             colour, seen = colour_score(
                 evidence.photographs, evidence.cameras, correction.apply(few)
             )
-            value = PointScore(colour=colour, position=None, seen=seen).value
+            value = PointAgreement(colour=colour, position=None, seen=seen).value
             tried.append((-value, len(tried), correction))
     return [correction for _, _, correction in sorted(tried)[:_KEEP]]
 
@@ -347,92 +350,68 @@ _ENOUGH = 300
 _PHOTOGRAPHS = 4
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Judged:
-    """A capture after one part of the examination."""
-
-    capture: Capture
-    """Corrected as far as that part goes."""
-
-    faults: list[Fault] = field(default_factory=list[Fault])
-    doubts: list[str] = field(default_factory=list[str])
-    unchecked: list[str] = field(default_factory=list[str])
-    figures: dict[str, Any] = field(default_factory=dict[str, Any])
-
-
 def judge_points(
     capture: Capture,
     evidence: PointEvidence,
+    findings: Findings,
     *,
     declared: Sequence[PointCorrection],
-    fits: Callable[[PointScore], bool],
-) -> Judged:
-    """Whether start points fit the cameras; if not, in which frame they do."""
+    fits: Callable[[PointAgreement], bool],
+) -> Capture:
+    """Whether start points fit the cameras; if not, the capture with those moved that are wrong."""
     cloud = capture.points
+    lacking = None
     if cloud is None or not len(cloud):
-        return Judged(
-            capture=capture,
-            unchecked=["start points against cameras: the capture has no points"],
-        )
-    if len(evidence.photographs.images) < _PHOTOGRAPHS:
-        return Judged(
-            capture=capture,
-            unchecked=["start points against cameras: there are too few photographs"],
-        )
+        lacking = "the capture has no points"
+    elif len(evidence.photographs.images) < _PHOTOGRAPHS:
+        lacking = "there are too few photographs"
+    if cloud is None or lacking is not None:
+        findings.unchecked.append(f"start points against cameras: {lacking}")
+        return capture
     given = evidence.score(cloud, unmoved())
-    figures = {"points": _point_figures(given)}
+    findings.figures["points"] = _point_figures(given)
     if fits(given):
-        return Judged(capture=capture, figures=figures)
+        return capture
     best = search_points(evidence, cloud, fits=fits, declared=declared)
     if not fits(best.score) or best.correction.changes_nothing:
-        return _unexplained(capture, evidence, given, figures)
-    figures["points_corrected"] = _point_figures(best.score)
+        return _unexplained(capture, evidence, given, findings)
+    findings.figures["points_corrected"] = _point_figures(best.score)
     if _poses_are_odd(capture, best.correction):
-        return _moved_poses(capture, best, given, figures)
-    return Judged(
-        capture=replace(capture, points=best.correction.apply(cloud)),
-        faults=[point_fault(best.correction, given.seen)],
-        figures=figures,
-    )
+        return _moved_poses(capture, best.correction, given, findings)
+    findings.faults.append(point_fault(best.correction, given.seen))
+    return replace(capture, points=best.correction.apply(cloud))
 
 
-def judge_up(capture: Capture) -> Judged:
-    """Whether the up axis that a capture states is how its photographs were held."""
+def judge_up(capture: Capture, findings: Findings) -> Capture:
+    """Whether the up axis stated is how photographs were held; if not, the capture with theirs."""
     up, length = photographs_up([view.camera for view in capture.views])
-    figures = {
-        "up": {
-            "stated": None if capture.up is None else list(capture.up),
-            "photographs": [round(float(v), 3) for v in up],
-            "certainty": round(length, 3),
-        }
+    findings.figures["up"] = {
+        "stated": None if capture.up is None else list(capture.up),
+        "photographs": [round(float(v), 3) for v in up],
+        "certainty": round(length, 3),
     }
     name, axis = nearest_axis(up)
     if length < CERTAIN:
-        return Judged(
-            capture=capture,
-            figures=figures,
-            unchecked=["the up axis: the photographs were held in all directions"],
-        )
+        findings.unchecked.append("the up axis: the photographs were held in all directions")
+        return capture
+    away = degrees_between(up, np.array(axis if capture.up is None else capture.up))
     if capture.up is None:
-        away = degrees_between(up, np.array(axis))
-        return Judged(
-            capture=capture,
-            figures=figures,
-            unchecked=[
-                "the up axis: the capture does not state it; in the photographs up is "
-                f"{away:.0f} degrees from {name}"
-            ],
+        findings.unchecked.append(
+            "the up axis: the capture does not state it; in the photographs up is "
+            f"{away:.0f} degrees from {name}"
         )
-    away = degrees_between(up, np.array(capture.up))
+        return capture
     if away < WRONG:
-        return Judged(capture=capture, figures=figures)
-    fault = Fault(
-        name="up-axis",
-        sentence=f"The up axis is wrong: {axis_name(capture.up)} is stated, but in the photographs "
-        f"up is {away:.0f} degrees away from it.",
-        remedy=f"The up axis is set to {name}.",
+        return capture
+    findings.faults.append(
+        Fault(
+            name="up-axis",
+            sentence=f"The up axis is wrong: {axis_name(capture.up)} is stated, but in the "
+            f"photographs up is {away:.0f} degrees away from it.",
+            remedy=f"The up axis is set to {name}.",
+        )
     )
-    return Judged(capture=replace(capture, up=axis), faults=[fault], figures=figures)
+    return replace(capture, up=axis)
 
 
 def _poses_are_odd(capture: Capture, move: PointCorrection) -> bool:
@@ -449,55 +428,55 @@ def _poses_are_odd(capture: Capture, move: PointCorrection) -> bool:
 
 
 def _moved_poses(
-    capture: Capture, best: ScoredPoints, given: PointScore, figures: dict[str, Any]
-) -> Judged:
-    move = best.correction
+    capture: Capture, move: PointCorrection, given: PointAgreement, findings: Findings
+) -> Capture:
     points_from_cameras = Similarity(
         rotation=torch.from_numpy(move.matrix),
         translation=torch.tensor(move.offset, dtype=torch.float64),
         scale=move.scale,
     ).inverse()
-    views = tuple(
-        replace(view, camera=view.camera.moved(points_from_cameras)) for view in capture.views
-    )
-    offset = points_from_cameras.translation.tolist()
+    x, y, z = points_from_cameras.translation.tolist()
     what = describe_move(
         PointCorrection(
             matrix=points_from_cameras.rotation.numpy(),
             scale=points_from_cameras.scale,
-            offset=(offset[0], offset[1], offset[2]) if any(move.offset) else (0.0, 0.0, 0.0),
+            offset=(x, y, z) if any(move.offset) else (0.0, 0.0, 0.0),
         )
     )
-    fault = Fault(
-        name="pose-frame",
-        sentence="The poses are in another world than the start points: "
-        f"{100 * given.seen:.0f} % of the points lie in view of two photographs or more, and the "
-        f"photographs are not upright in the world that is stated; {what} corrects both.",
-        remedy=f"The poses are moved: {what}.",
+    findings.faults.append(
+        Fault(
+            name="pose-frame",
+            sentence="The poses are in another world than the start points: "
+            f"{100 * given.seen:.0f} % of the points lie in view of two photographs or more, and "
+            f"the photographs are not upright in the world that is stated; {what} corrects both.",
+            remedy=f"The poses are moved: {what}.",
+        )
     )
-    return Judged(capture=replace(capture, views=views), faults=[fault], figures=figures)
+    views = (replace(view, camera=view.camera.moved(points_from_cameras)) for view in capture.views)
+    return replace(capture, views=tuple(views))
 
 
 def _unexplained(
-    capture: Capture, evidence: PointEvidence, given: PointScore, figures: dict[str, Any]
-) -> Judged:
+    capture: Capture, evidence: PointEvidence, given: PointAgreement, findings: Findings
+) -> Capture:
     positions = evidence.triangulated
     enough = len(positions) >= _ENOUGH
-    fault = Fault(
-        name="unexplained-points",
-        sentence="The start points do not fit the cameras, and no change of axes or scale makes "
-        f"them ({100 * given.seen:.0f} % lie in view of two photographs or more).",
-        remedy=f"They are replaced by {len(positions)} matches that the cameras triangulate."
-        if enough
-        else "",
+    findings.faults.append(
+        Fault(
+            name="unexplained-points",
+            sentence="The start points do not fit the cameras, and no change of axes or scale "
+            f"makes them ({100 * given.seen:.0f} % lie in view of two photographs or more).",
+            remedy=f"They are replaced by {len(positions)} matches that the cameras triangulate."
+            if enough
+            else "",
+        )
     )
     if not enough:
-        return Judged(capture=capture, faults=[fault], figures=figures)
-    cloud = PointCloud(points=torch.from_numpy(positions).float())
-    return Judged(capture=replace(capture, points=cloud), faults=[fault], figures=figures)
+        return capture
+    return replace(capture, points=PointCloud(points=torch.from_numpy(positions).float()))
 
 
-def _point_figures(score: PointScore) -> dict[str, Any]:
+def _point_figures(score: PointAgreement) -> dict[str, Any]:
     return {
         "colours": None if score.colour is None else round(score.colour, 4),
         "places": None if score.position is None else round(score.position, 4),

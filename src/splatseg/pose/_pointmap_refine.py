@@ -27,7 +27,7 @@ class Spread:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Seen:
+class PointErrors:
     """Points of some pairs in the cameras of their photographs."""
 
     camera: Float[Tensor, "pairs 2 samples 3"]
@@ -67,13 +67,15 @@ class Problem:
         """How much points are believed: their confidence and their pair's weight."""
         return self.samples.weights[pairs].double() * state.weight[pairs, None, None]
 
-    def weights(self, state: Aligned, pairs: Tensor, found: Seen) -> Float[Tensor, "n 2 samples"]:
+    def weights(
+        self, state: Aligned, pairs: Tensor, found: PointErrors
+    ) -> Float[Tensor, "n 2 samples"]:
         """Weights of squares, with which their sum has the slope of what is minimised (IRLS)."""
         robust = (1 + found.square(self.spread)).rsqrt()
         return self.trust(state, pairs) * found.ahead * robust
 
 
-def seen(samples: PairSamples, state: Aligned, pairs: Int64[Tensor, "n"]) -> Seen:
+def seen(samples: PairSamples, state: Aligned, pairs: Int64[Tensor, "n"]) -> PointErrors:
     """The points of these pairs, with the first camera's pose for that of the pair."""
     views = samples.views[pairs]
     scaled = state.scale[pairs, None, None, None] * samples.points[pairs].double()
@@ -83,7 +85,7 @@ def seen(samples: PairSamples, state: Aligned, pairs: Int64[Tensor, "n"]) -> See
     expected = state.depth[views]
     depth = torch.maximum(camera[..., 2], MIN_DEPTH_SHARE * expected)
     plane = ray_directions(samples.offsets[views], state.focal[views])[..., :2]
-    return Seen(
+    return PointErrors(
         camera=camera,
         across=camera[..., :2] / depth.unsqueeze(-1) - plane,
         along=(depth / expected).log(),

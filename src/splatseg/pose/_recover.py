@@ -9,7 +9,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, cast
@@ -213,10 +213,10 @@ def recover_poses(
     """
     source = Path(photographs)
     require_pycolmap()
-    tell = _teller(progress)
+    tell = teller(progress)
     if folder is None and is_video(source):
         raise InputError("folder: expected a folder for the frames of the video, got None.")
-    with _given_or_temporary(folder) as kept:
+    with given_or_temporary(folder) as kept:
         if is_video(source):
             root, files = kept, _frames(source, kept, options, tell)
         else:
@@ -237,13 +237,19 @@ def recover_poses(
 
 
 @contextmanager
-def _given_or_temporary(folder: Path | str | None) -> Generator[Path]:
-    """The folder; where there is none, one that is deleted afterwards."""
-    if folder is not None:
-        yield Path(folder)
+def given_or_temporary(folder: Path | str | None) -> Generator[Path]:
+    """The folder, removed again if it is left empty; for None one that is deleted afterwards."""
+    if folder is None:
+        with tempfile.TemporaryDirectory(prefix="splatseg-") as temporary:
+            yield Path(temporary)
         return
-    with tempfile.TemporaryDirectory(prefix="splatseg-") as temporary:
-        yield Path(temporary)
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        yield folder
+    finally:
+        with suppress(OSError):  # it is not empty
+            folder.rmdir()
 
 
 def _recover(
@@ -286,7 +292,7 @@ def _recover(
             f"{source}: expected photographs of one scene of which at least {MIN_PHOTOGRAPHS} "
             f"can be placed, got {placed} of {len(files)}; {HOW_TO_PHOTOGRAPH}."
         )
-    capture = load_capture(work / "model", files, root=_root_of(files))
+    capture = load_capture(work / "model", files, root=files[0].parent)
     report = _report(
         result,
         lenses,
@@ -318,10 +324,6 @@ def _worker_job(
             "threads": threads,
         },
     }
-
-
-def _root_of(files: Sequence[Path]) -> Path:
-    return files[0].parent
 
 
 def _work_folder(folder: Path, made_of: str) -> Path:
@@ -433,7 +435,9 @@ def _why(copy: str, facts: Mapping[str, int] | None, members: Sequence[Sequence[
     )
 
 
-def _teller(progress: Callable[[PoseProgress], None] | None) -> Callable[[str, int, int], None]:
+def teller(progress: Callable[[PoseProgress], None] | None) -> Callable[[str, int, int], None]:
+    """Progress as stage, done and total; None is told nothing."""
+
     def tell(stage: str, done: int, total: int) -> None:
         if progress is not None:
             progress(PoseProgress(stage=stage, done=done, total=total))

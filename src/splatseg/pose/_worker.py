@@ -56,7 +56,7 @@ def main() -> int:
     # Warnings of COLMAP go to the standard error stream, which the parent keeps in a file.
     pycolmap.logging.minloglevel = 1
     job = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
-    result = Job(job).run()
+    result = WorkerJob(job).run()
     out = Path(job["result"])
     temporary = out.with_suffix(".tmp")
     temporary.write_text(json.dumps(result), encoding="utf-8")
@@ -65,7 +65,7 @@ def main() -> int:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Model:
+class FoundModel:
     """What one mapper made: its largest model, and the smaller ones."""
 
     mapper: str
@@ -86,10 +86,10 @@ class Model:
         kept = [r for r in found if r.num_reg_images() >= 2 and r.num_points3D() > 0]
         kept.sort(key=lambda r: (-r.num_reg_images(), r.compute_mean_reprojection_error()))
         if not kept:
-            return Model(
+            return FoundModel(
                 mapper=mapper, reconstructions=(), registered=0, error=0.0, seconds=seconds
             )
-        return Model(
+        return FoundModel(
             mapper=mapper,
             reconstructions=tuple(kept),
             registered=int(kept[0].num_reg_images()),
@@ -109,7 +109,7 @@ class Model:
         }
 
 
-class Job:
+class WorkerJob:
     """One set of photographs."""
 
     def __init__(self, job: dict[str, Any]) -> None:
@@ -281,13 +281,13 @@ class Job:
 
     # -- mapping ----------------------------------------------------------------------------
 
-    def _map(self) -> tuple[list[Model], Model | None]:
+    def _map(self) -> tuple[list[FoundModel], FoundModel | None]:
         """Every try, and the one with the most photographs and then the least error."""
         plain = self._copied("plain")
         guessed = any(not lens["prior"] for lens in self._lenses)
         database = self._calibrated() if guessed else plain
         mapper = self._options["mapper"]
-        tries: list[Model] = []
+        tries: list[FoundModel] = []
         if mapper in ("auto", "global"):
             tries.append(self._global(database))
         if mapper == "incremental" or (mapper == "auto" and not self._good(tries)):
@@ -299,7 +299,7 @@ class Job:
         best = min(found, key=lambda a: (-a.registered, a.error), default=None)
         return tries, best
 
-    def _good(self, tries: Sequence[Model]) -> bool:
+    def _good(self, tries: Sequence[FoundModel]) -> bool:
         return any(a.registered == len(self._names) and a.error <= _GOOD_ERROR for a in tries)
 
     def _copied(self, name: str) -> Path:
@@ -321,16 +321,16 @@ class Job:
         pycolmap.calibrate_view_graph(database, options)
         return database
 
-    def _global(self, database: Path) -> Model:
+    def _global(self, database: Path) -> FoundModel:
         options = pycolmap.GlobalPipelineOptions()
         options.num_threads = self._options["threads"]
         options.random_seed = self._options["seed"]
         begin = time.monotonic()
         _tell("global mapper", 0, 0)
         found = pycolmap.global_mapping(database, self._images, self._empty("global"), options)
-        return Model.of("global", list(found.values()), time.monotonic() - begin)
+        return FoundModel.of("global", list(found.values()), time.monotonic() - begin)
 
-    def _incremental(self, database: Path, name: str) -> Model:
+    def _incremental(self, database: Path, name: str) -> FoundModel:
         options = pycolmap.IncrementalPipelineOptions()
         options.num_threads = self._options["threads"]
         options.random_seed = self._options["seed"]
@@ -350,7 +350,7 @@ class Job:
             options,
             next_image_callback=next_image,
         )
-        return Model.of(name, list(found.values()), time.monotonic() - begin)
+        return FoundModel.of(name, list(found.values()), time.monotonic() - begin)
 
     def _empty(self, name: str) -> Path:
         folder = self._folder / name
@@ -360,7 +360,7 @@ class Job:
 
     # -- what came of it --------------------------------------------------------------------
 
-    def _finish(self, best: Model) -> dict[str, Any]:
+    def _finish(self, best: FoundModel) -> dict[str, Any]:
         reconstruction = best.reconstructions[0]
         facts = model_facts(reconstruction)
         facts["without_distortion"] = finish_model(
@@ -389,7 +389,7 @@ class Job:
             database.close()
 
 
-def _members(best: Model) -> list[list[str]]:
+def _members(best: FoundModel) -> list[list[str]]:
     """Names of the photographs of each model of a try, the largest first."""
     return [
         sorted(model.image(id).name for id in model.reg_image_ids())

@@ -1,11 +1,10 @@
 """The doctor: finds the usual faults of posed captures and corrects them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatseg.core import Capture, PointCloud, View
 from splatseg.core.boundary import boundary
@@ -25,6 +24,7 @@ from splatseg.pose._doctor_cameras import PointCorrection as PointCorrection
 from splatseg.pose._doctor_cameras import axis_rotations as axis_rotations
 from splatseg.pose._doctor_faults import (
     HALF_PIXEL_SIGMA,
+    Findings,
     camera_faults,
     focal_is_off,
     intrinsics_doubts,
@@ -37,12 +37,12 @@ from splatseg.pose._doctor_files import Read as Read
 from splatseg.pose._doctor_files import declared_transforms as declared_transforms
 from splatseg.pose._doctor_files import read_for_doctor as read_for_doctor
 from splatseg.pose._doctor_files import write_corrected as write_corrected
-from splatseg.pose._doctor_matches import Matches as Matches
+from splatseg.pose._doctor_matches import ViewMatches as ViewMatches
 from splatseg.pose._doctor_matches import match_views as match_views
 from splatseg.pose._doctor_points import (
-    Photographs,
+    PointAgreement,
     PointEvidence,
-    PointScore,
+    ReducedPhotographs,
     judge_points,
     judge_up,
     load_photographs,
@@ -60,7 +60,7 @@ AS_GOOD = 0.9
 """Cameras as given stay if their agreement is this share of the best correction's."""
 
 POINTS_FIT = 0.3
-"""Least agreement of start points (`PointScore.value`) that is called a fit. Healthy captures
+"""Least agreement of start points (`PointAgreement.value`) that is called a fit. Healthy captures
 have 0.5 to 0.8, wrong ones under 0.15."""
 
 POINTS_FIT_COLOURS = 0.12
@@ -74,58 +74,55 @@ _ESTIMATED = 3
 _POINT_VIEWS, _POINT_LONGEST = 20, 320
 
 
-def fits(score: PointScore) -> bool:
+def fits(score: PointAgreement) -> bool:
     """Whether start points fit the cameras."""
     return score.value >= (POINTS_FIT_COLOURS if score.position is None else POINTS_FIT)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Examination:
-    """What is known of the cameras."""
+def examine(
+    capture: Capture, views: Sequence[View], matches: ViewMatches, findings: Findings
+) -> tuple[CameraCorrection, PointEvidence]:
+    """Hold the cameras, and every correction of a usual fault, against the matches.
 
-    photographs: Photographs
-    figures: dict[str, Any]
-    correction: CameraCorrection = field(default_factory=no_correction)
-    faults: Sequence[Fault] = ()
-    doubts: Sequence[str] = ()
-    unchecked: Sequence[str] = ()
-    triangulated: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
-    depth: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
-
-
-def examine(capture: Capture, views: Sequence[View], matches: Matches) -> Examination:
-    """Hold the cameras, and every correction of a usual fault, against the matches."""
+    Returns:
+        What corrects the cameras, and what points can be held against then.
+    """
     photographs = photographs_of_points(matches, views)
-    figures: dict[str, Any] = {
-        "photographs": len(np.unique(matches.views)),
-        "pairs": len(matches.views),
-        "matches": len(matches),
-    }
+    findings.figures.update(
+        {
+            "photographs": len(np.unique(matches.views)),
+            "pairs": len(matches.views),
+            "matches": len(matches),
+        }
+    )
+    none = no_correction()
     if len(matches) < MIN_MATCHES or len(matches.views) < _MIN_PAIRS:
-        return Examination(
-            unchecked=[
-                f"cameras against each other: only {len(matches)} matches in "
-                f"{len(matches.views)} pairs of photographs were found"
-            ],
-            figures=figures,
-            photographs=photographs,
+        findings.unchecked.append(
+            f"cameras against each other: only {len(matches)} matches in "
+            f"{len(matches.views)} pairs of photographs were found"
         )
+        return none, _point_evidence(None, none, views, photographs)
     evidence = match_evidence(matches, [view.camera for view in views])
     correction, best = _choose(capture, views, evidence, photographs)
-    given = evidence.agreement(no_correction())
-    figures["agreement"] = round(given, 4)
+    given = evidence.agreement(none)
+    findings.figures["agreement"] = round(given, 4)
     if best.agreement < EXPLAINED:
-        return _unexplained(evidence, best, figures, photographs)
-    return _judged(
-        capture,
-        evidence,
-        correction,
-        figures=figures,
-        photographs=photographs,
-    )
+        correction = none
+        findings.faults.append(
+            Fault(
+                name="unexplained-poses",
+                sentence=f"The cameras do not fit the photographs: {100 * given:.0f} % of the "
+                f"matches agree with them, and {100 * best.agreement:.0f} % under the best "
+                "correction that was tried.",
+                remedy="",
+            )
+        )
+    else:
+        correction = _judged(capture, evidence, correction, findings)
+    return correction, _point_evidence(evidence, correction, views, photographs)
 
 
-def photographs_of_points(matches: Matches, views: Sequence[View]) -> Photographs:
+def photographs_of_points(matches: ViewMatches, views: Sequence[View]) -> ReducedPhotographs:
     """Small photographs to hold points against, of some of the views that were matched."""
     used = np.unique(matches.views) if len(matches) else np.arange(len(views))
     chosen = used[np.linspace(0, len(used) - 1, min(_POINT_VIEWS, len(used))).round().astype(int)]
@@ -133,7 +130,10 @@ def photographs_of_points(matches: Matches, views: Sequence[View]) -> Photograph
 
 
 def _choose(
-    capture: Capture, views: Sequence[View], evidence: MatchEvidence, photographs: Photographs
+    capture: Capture,
+    views: Sequence[View],
+    evidence: MatchEvidence,
+    photographs: ReducedPhotographs,
 ) -> tuple[CameraCorrection, Scored]:
     """The correction to take, and the best one by matches alone."""
     none = no_correction()
@@ -182,82 +182,59 @@ def _points_under(
     views: Sequence[View],
     evidence: MatchEvidence,
     correction: CameraCorrection,
-    photographs: Photographs,
-) -> PointScore | None:
+    photographs: ReducedPhotographs,
+) -> PointAgreement | None:
     if capture.points is None or not len(capture.points):
         return None
-    triangulated, depth = evidence.triangulated(correction)
-    held = PointEvidence(
+    return _point_evidence(evidence, correction, views, photographs).score(
+        capture.points, unmoved()
+    )
+
+
+def _point_evidence(
+    evidence: MatchEvidence | None,
+    correction: CameraCorrection,
+    views: Sequence[View],
+    photographs: ReducedPhotographs,
+) -> PointEvidence:
+    """What points are held against once cameras are corrected."""
+    triangulated, depth = np.zeros((0, 3)), np.zeros(0)
+    if evidence is not None:
+        triangulated, depth = evidence.triangulated(correction)
+    return PointEvidence(
         photographs=photographs,
         cameras=tuple(correction.apply(view.camera) for view in views),
-        triangulated=triangulated,
-        depth=depth,
-    )
-    return held.score(capture.points, unmoved())
-
-
-def _unexplained(
-    evidence: MatchEvidence, best: Scored, figures: dict[str, Any], photographs: Photographs
-) -> Examination:
-    given = figures["agreement"]
-    fault = Fault(
-        name="unexplained-poses",
-        sentence=f"The cameras do not fit the photographs: {100 * given:.0f} % of the matches "
-        f"agree with them, and {100 * best.agreement:.0f} % under the best correction that was "
-        "tried.",
-        remedy="",
-    )
-    triangulated, depth = evidence.triangulated(no_correction())
-    return Examination(
-        faults=[fault],
-        figures=figures,
-        photographs=photographs,
         triangulated=triangulated,
         depth=depth,
     )
 
 
 def _judged(
-    capture: Capture,
-    evidence: MatchEvidence,
-    correction: CameraCorrection,
-    *,
-    figures: dict[str, Any],
-    photographs: Photographs,
-) -> Examination:
+    capture: Capture, evidence: MatchEvidence, correction: CameraCorrection, findings: Findings
+) -> CameraCorrection:
     """Name the faults of the correction found, and look for small errors besides."""
-    doubts: list[str] = []
-    unchecked: list[str] = []
     estimate = estimate_intrinsics(evidence, correction)
-    small: list[Fault] = []
+    off = None
     if estimate is not None:
         whole = replace(estimate, focal=estimate.focal * correction.focal)
         factor = whole.focal if focal_is_off(whole) else 1.0
         correction = replace(correction, focal=factor)
         off = shift_fault(estimate, float(evidence.longest.max()))
         if off is not None:
-            small.append(off[0])
             correction = replace(correction, shift=off[1])
-        doubts += intrinsics_doubts(whole, judged=off is not None)
+        findings.doubts.extend(intrinsics_doubts(whole, judged=off is not None))
         if max(estimate.shift_sigma) >= HALF_PIXEL_SIGMA:
             dx, dy = estimate.shift_sigma
-            unchecked.append(
+            findings.unchecked.append(
                 "half a pixel of the principal point: these views tell it to "
                 f"+-({dx:.2f}, {dy:.2f}) px only"
             )
-        figures |= _estimate_figures(whole)
-    triangulated, depth = evidence.triangulated(correction)
-    figures["agreement_corrected"] = round(evidence.agreement(correction), 4)
-    return Examination(
-        correction=correction,
-        faults=[*camera_faults(correction, capture), *small],
-        doubts=doubts,
-        unchecked=unchecked,
-        figures=figures,
-        photographs=photographs,
-        triangulated=triangulated,
-        depth=depth,
-    )
+        findings.figures.update(_estimate_figures(whole))
+    findings.faults.extend(camera_faults(correction, capture))
+    if off is not None:
+        findings.faults.append(off[0])
+    findings.figures["agreement_corrected"] = round(evidence.agreement(correction), 4)
+    return correction
 
 
 def _estimate_figures(estimate: IntrinsicsEstimate) -> dict[str, Any]:
@@ -305,7 +282,7 @@ def diagnose(
     options: DoctorOptions | None = None,
     found: Sequence[Fault] = (),
     declared: Sequence[PointCorrection] = (),
-    matches: Matches | None = None,
+    matches: ViewMatches | None = None,
 ) -> Diagnosis:
     """Find the usual faults of a posed capture and correct them in memory.
 
@@ -313,7 +290,7 @@ def diagnose(
     of a usual fault, and every pair of them, is held against the matches (epipolar distance and
     depth in front) and against the start points (colours, and places of triangulated matches).
     What was given stays unless another reading agrees clearly better. Thresholds are the
-    constants of `_examine` and of `_judge`; ``docs/doctor.md`` explains them.
+    constants of this module and of `_doctor_faults`; ``docs/doctor.md`` explains them.
 
     Args:
         capture: The capture.
@@ -330,33 +307,22 @@ def diagnose(
     views = [view for view in capture.views if view.image is not None]
     if matches is None:
         matches = match_views(views, max_views=checked.max_views, longest=_LONGEST)
-    examination = examine(capture, views, matches)
-    faults = [*found, *examination.faults]
-    doubts = [*_missing(capture), *examination.doubts]
-    unchecked = list(examination.unchecked)
-    figures = dict(examination.figures)
-    evidence = PointEvidence(
-        photographs=examination.photographs,
-        cameras=tuple(examination.correction.apply(view.camera) for view in views),
-        triangulated=examination.triangulated,
-        depth=examination.depth,
+    findings = Findings(faults=list(found), doubts=_missing(capture))
+    correction, evidence = examine(capture, views, matches, findings)
+    corrected = judge_points(
+        _corrected(capture, correction), evidence, findings, declared=declared, fits=fits
     )
-    world = judge_points(
-        _corrected(capture, examination.correction), evidence, declared=declared, fits=fits
+    corrected = judge_up(corrected, findings)
+    helpless = any(
+        fault.name.startswith("unexplained") and not fault.remedy for fault in findings.faults
     )
-    upright = judge_up(world.capture)
-    faults += [*world.faults, *upright.faults]
-    doubts += upright.doubts
-    unchecked += [*world.unchecked, *upright.unchecked]
-    figures |= {**world.figures, **upright.figures}
-    helpless = any(fault.name.startswith("unexplained") and not fault.remedy for fault in faults)
     return Diagnosis(
         capture=capture,
-        faults=tuple(faults),
-        doubts=tuple(doubts),
-        unchecked=tuple(unchecked),
-        figures=figures,
-        corrected=upright.capture if faults and not helpless else None,
+        faults=tuple(findings.faults),
+        doubts=tuple(findings.doubts),
+        unchecked=tuple(findings.unchecked),
+        figures=findings.figures,
+        corrected=corrected if findings.faults and not helpless else None,
     )
 
 
@@ -377,7 +343,7 @@ def find_points(
     The search of `diagnose` for start points, on any cloud, such as the centres of Gaussians.
 
     Args:
-        capture: Photographs with cameras.
+        capture: ReducedPhotographs with cameras.
         cloud: Points, with colours where they are known.
         options: How thoroughly to look.
 
@@ -390,13 +356,8 @@ def find_points(
     if len(matches) < MIN_MATCHES:
         return None
     evidence = match_evidence(matches, [view.camera for view in views])
-    triangulated, depth = evidence.triangulated(no_correction())
-    held = PointEvidence(
-        photographs=photographs_of_points(matches, views),
-        cameras=evidence.cameras,
-        triangulated=triangulated,
-        depth=depth,
-    )
+    photographs = photographs_of_points(matches, views)
+    held = _point_evidence(evidence, no_correction(), views, photographs)
     best = search_points(held, cloud, fits=fits)
     return best.correction if fits(best.score) else None
 

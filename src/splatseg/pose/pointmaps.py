@@ -1,9 +1,7 @@
 """Photographs and a network of pointmaps in, a capture with cameras and a dense cloud out."""
 
-import tempfile
 import time
-from collections.abc import Callable, Generator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -46,7 +44,7 @@ from splatseg.pose._pointmap_start import (
     spanning_tree,
     tree_world,
 )
-from splatseg.pose._recover import PoseProgress
+from splatseg.pose._recover import PoseProgress, given_or_temporary, teller
 from splatseg.pose._saved import (
     ANSWERS,
     SavedWorld,
@@ -177,11 +175,11 @@ def recover_from_pointmaps(
         raise InputError(f"{bad[0].name}: expected photographs that can be read, got {bad[0].why}.")
     asked = _CONSTANTS | asdict(options) | {"source": source_digest(source)}
     made_of = content_digest(files, asked)
-    with _given_or_temporary(folder) as kept:
+    with given_or_temporary(folder) as kept:
         world = load_world(kept, made_of=made_of)
         reused = world is not None
         if world is None:
-            tell = _teller(progress)
+            tell = teller(progress)
             world = _find(good, source, kept, options=options, tell=tell, begun=begun)
             save_world(world, kept, made_of=made_of)
     capture = capture_of_world(world, good, files[0].parent)
@@ -315,29 +313,6 @@ def _report(
     )
 
 
-@contextmanager
-def _given_or_temporary(folder: Path | None) -> Generator[Path]:
-    """The folder; where there is none, one that is deleted afterwards. None is left empty."""
-    if folder is not None:
-        folder.mkdir(parents=True, exist_ok=True)
-        try:
-            yield folder
-        finally:
-            with suppress(OSError):  # it is not empty
-                folder.rmdir()
-        return
-    with tempfile.TemporaryDirectory(prefix="splatseg-") as temporary:
-        yield Path(temporary)
-
-
-def _teller(progress: Callable[[PoseProgress], None] | None) -> _Tell:
-    def tell(stage: str, done: int, total: int) -> None:
-        if progress is not None:
-            progress(PoseProgress(stage=stage, done=done, total=total))
-
-    return tell
-
-
 # The aligned pairs once more, at all their pixels: depth maps of photographs and a cloud.
 
 
@@ -353,7 +328,7 @@ _DRAWN_MORE = 1.6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class DepthMaps:
+class PointmapDepths:
     """Depths of the photographs at the pixels of their pointmaps, float32."""
 
     depth: tuple[Float[Tensor, "rows columns"], ...]
@@ -370,7 +345,7 @@ def read_depth_maps(
     source: PairSource,
     *,
     progress: Callable[[int, int], None],
-) -> DepthMaps:
+) -> PointmapDepths:
     """Bring all pixels of the pairs that are believed into their cameras, one pair at a time.
 
     Memory is three numbers a pixel of each photograph, however many pairs there are.
@@ -397,13 +372,13 @@ def read_depth_maps(
         depths.append(torch.where(weight > 0, mean.exp(), 0.0))
         # Pairs that differ by as much as a contradiction halve what is known.
         sures.append(weight / (1 + spread / _CONTRADICTION**2))
-    return DepthMaps(depth=tuple(depths), sure=tuple(sures))
+    return PointmapDepths(depth=tuple(depths), sure=tuple(sures))
 
 
 def draw_cloud(
     photographs: Sequence[PhotographSize],
     aligned: Aligned,
-    maps: DepthMaps,
+    maps: PointmapDepths,
     *,
     count: int,
     seed: int,
@@ -465,7 +440,7 @@ def _depth_in_camera(aligned: Aligned, pair: int, view: int, points: Tensor) -> 
 def _contradicted(
     photographs: Sequence[PhotographSize],
     aligned: Aligned,
-    maps: DepthMaps,
+    maps: PointmapDepths,
     *,
     own: int,
     points: Tensor,

@@ -30,7 +30,7 @@ from splatseg.core.scans import Scan
 from splatseg.errors import InputError, RangeError
 from splatseg.io.npy import read_npy
 from splatseg.io.write_errors import named_write_failures
-from splatseg.street.blocks import BlockShare, Drive, DriveBlock
+from splatseg.street.blocks import BlockShare, DriveBlock, DriveBlocks
 
 
 @runtime_checkable
@@ -47,7 +47,7 @@ class DriveField:
 
     A view is that of the block that counts most at its camera. A point takes the id with the
     largest sum of confidences over blocks, each times what the block counts there
-    (`Drive.shares`). What a drive of one block says is what the block says.
+    (`DriveBlocks.shares`). What a drive of one block says is what the block says.
 
     Args:
         drive: How the drive was cut.
@@ -64,7 +64,7 @@ class DriveField:
     @boundary
     def __init__(
         self,
-        drive: Drive,
+        drive: DriveBlocks,
         open_block: Callable[[DriveBlock], Renderable],
         *,
         max_open: int = 2,
@@ -306,7 +306,7 @@ around it."""
 
 
 @boundary
-def block_capture(capture: Capture, drive: Drive, block: DriveBlock) -> Capture:
+def block_capture(capture: Capture, drive: DriveBlocks, block: DriveBlock) -> Capture:
     """The part of a capture that a block is made from.
 
     Its views are those at whose place the block counts, so that views of an overlap are of both
@@ -325,7 +325,7 @@ def block_capture(capture: Capture, drive: Drive, block: DriveBlock) -> Capture:
 
 
 @boundary
-def block_views(views: Sequence[View], drive: Drive, block: DriveBlock) -> tuple[View, ...]:
+def block_views(views: Sequence[View], drive: DriveBlocks, block: DriveBlock) -> tuple[View, ...]:
     """The views at whose place a block counts, in their order.
 
     Raises:
@@ -343,7 +343,7 @@ def block_views(views: Sequence[View], drive: Drive, block: DriveBlock) -> tuple
     return found
 
 
-def _cloud(cloud: PointCloud | None, drive: Drive, block: DriveBlock) -> PointCloud | None:
+def _cloud(cloud: PointCloud | None, drive: DriveBlocks, block: DriveBlock) -> PointCloud | None:
     if cloud is None:
         return None
     near = drive.near(block, cloud.points)
@@ -365,7 +365,7 @@ class DriveScans:
     """
 
     @boundary
-    def __init__(self, scans: ScanSource, drive: Drive) -> None:
+    def __init__(self, scans: ScanSource, drive: DriveBlocks) -> None:
         self._scans, self._drive = scans, drive
         self._facts = {name: _facts(scans.scan(name), drive) for name in scans.scan_names}
         self._built_from: dict[int, list[str]] = {}
@@ -415,7 +415,7 @@ class _Facts:
     makes: tuple[int, ...]
 
 
-def _facts(scan: Scan, drive: Drive) -> _Facts:
+def _facts(scan: Scan, drive: DriveBlocks) -> _Facts:
     if scan.origin is not None:
         at = drive.shares(scan.origin.unsqueeze(0))
         makes = tuple(share.block for share in at)
@@ -430,7 +430,7 @@ class _NearScans:
     """Some scans of a source, and their points in reach of a block; a `core.ScanSource`."""
 
     def __init__(
-        self, scans: ScanSource, names: Sequence[str], drive: Drive, block: DriveBlock
+        self, scans: ScanSource, names: Sequence[str], drive: DriveBlocks, block: DriveBlock
     ) -> None:
         self._scans, self._names = scans, tuple(names)
         self._drive, self._block = drive, block
@@ -452,7 +452,7 @@ class ScansToLabel:
     """Some scans of a source, and their points at which a block counts; a `core.ScanSource`."""
 
     def __init__(
-        self, scans: ScanSource, names: Sequence[str], drive: Drive, block: DriveBlock
+        self, scans: ScanSource, names: Sequence[str], drive: DriveBlocks, block: DriveBlock
     ) -> None:
         """Take what `DriveScans.to_label` knows."""
         self._scans, self._names = scans, tuple(names)

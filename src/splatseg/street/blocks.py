@@ -24,6 +24,7 @@ from torch import Tensor
 from splatseg._check import check_finite, check_shape
 from splatseg.core import View
 from splatseg.core.boundary import boundary, convert_fields
+from splatseg.core.options import Positive, options
 from splatseg.core.view_names import frame_number
 from splatseg.errors import InputError, RangeError
 
@@ -33,25 +34,21 @@ _TOLERANCE = 0.005
 """By how much of the overlap the line may be straightened: weights change by no more."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@options
 class DriveBlockOptions:
-    """How drives are cut. Lengths are metres."""
+    """How drives are cut into blocks. Lengths are metres."""
 
-    length: float = 80.0
-    """Of a block along the drive, its overlaps included, at most."""
+    length: Positive = 80.0
+    """Maximum length of a block along the drive, including its overlaps, metres."""
 
-    overlap: float = 20.0
-    """What two blocks that follow each other share, less than the length."""
+    overlap: Positive = 20.0
+    """Overlap of two consecutive blocks, metres, less than the length."""
 
-    reach: float = 60.0
-    """How far from its part of the drive a block has points. A drive of one block has all."""
+    reach: Positive = 60.0
+    """Maximum distance of a block's points from its part of the drive, metres. A drive of one
+    block has all points."""
 
     def __post_init__(self) -> None:
-        convert_fields(self)
-        for name in ("length", "overlap", "reach"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0):
-                raise RangeError(f"{name}: expected a positive number of metres, got {value}.")
         if self.overlap >= self.length:
             raise RangeError(
                 f"overlap: expected less than the length of {self.length:g} m, got "
@@ -115,7 +112,7 @@ def _no_places() -> Float[Tensor, "0 3"]:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Drive:
+class DriveBlocks:
     """A drive in blocks: `cut_drive`.
 
     Raises:
@@ -251,7 +248,7 @@ def cut_drive(
     *,
     options: DriveBlockOptions | None = None,
     metres_per_unit: float = 1.0,
-) -> Drive:
+) -> DriveBlocks:
     """Cut a drive into the fewest equal blocks that are not longer than asked for.
 
     What stands still makes no way: places nearer than an eighth of the overlap to the last one
@@ -290,7 +287,7 @@ def cut_drive(
     blocks: list[DriveBlock] = []
     for first, last in pairwise(starts):
         blocks += _blocks(places[first:last], length, overlap, before=blocks)
-    return Drive(blocks=tuple(blocks), overlap=overlap, reach=options.reach / metres_per_unit)
+    return DriveBlocks(blocks=tuple(blocks), overlap=overlap, reach=options.reach / metres_per_unit)
 
 
 def _blocks(

@@ -26,7 +26,7 @@ from splatseg.io.tensors import read_safetensors, read_safetensors_words
 from splatseg.io.tensors_writing import write_tensors
 from splatseg.io.write_errors import named_write_failures
 from splatseg.street.block_field import DriveField, joined_layers
-from splatseg.street.blocks import Drive, DriveBlock
+from splatseg.street.blocks import DriveBlock, DriveBlocks
 from splatseg.street.field import VERTEX_RULES, MeshField, VertexRule, with_vertex_rule
 from splatseg.street.primitives import PrimitiveMesh
 from splatseg.street.radiance import RadianceModel, RadianceOptions
@@ -277,7 +277,7 @@ DRIVE_VERSION = 1
 
 @boundary
 def build_blocks(
-    drive: Drive,
+    drive: DriveBlocks,
     folder: Path,
     make: Callable[[DriveBlock], MeshField],
     *,
@@ -318,7 +318,7 @@ def build_blocks(
 
 
 @boundary
-def goes_on(drive: Drive, folder: Path, *, about: Mapping[str, Any] | None = None) -> bool:
+def goes_on(drive: DriveBlocks, folder: Path, *, about: Mapping[str, Any] | None = None) -> bool:
     """Whether `build_blocks` of the same would go on with what a folder holds.
 
     Raises:
@@ -408,7 +408,7 @@ def open_blocks(
 
 
 @boundary
-def save_drive(drive: Drive, path: Path, *, about: Mapping[str, Any] | None = None) -> None:
+def save_drive(drive: DriveBlocks, path: Path, *, about: Mapping[str, Any] | None = None) -> None:
     """Write how a drive was cut; atomic, exact. Inverse of `load_drive`.
 
     Raises:
@@ -419,7 +419,7 @@ def save_drive(drive: Drive, path: Path, *, about: Mapping[str, Any] | None = No
 
 
 @boundary
-def load_drive(path: Path) -> Drive:
+def load_drive(path: Path) -> DriveBlocks:
     """Read how a drive was cut.
 
     Raises:
@@ -438,7 +438,7 @@ def load_drive(path: Path) -> Drive:
     if not isinstance(rows, list):
         raise FileFormatError(f"{path}: expected a list of blocks, got none.")
     with made_from(path):
-        return Drive(
+        return DriveBlocks(
             blocks=tuple(
                 _block(row, i, where=f"{path}: blocks[{i}]")
                 for i, row in enumerate(cast("list[object]", rows))
@@ -448,7 +448,7 @@ def load_drive(path: Path) -> Drive:
         )
 
 
-def _content(drive: Drive, about: Mapping[str, Any]) -> dict[str, Any]:
+def _content(drive: DriveBlocks, about: Mapping[str, Any]) -> dict[str, Any]:
     return {
         "format": DRIVE_FORMAT,
         "version": DRIVE_VERSION,

@@ -43,7 +43,7 @@ _SMALLEST = 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class StepGradients:
+class RadianceGradients:
     """What a step found."""
 
     colour_loss: float
@@ -97,7 +97,7 @@ class StepWorker:
         """What rays of all steps so far saw of each vertex: their weights of eq. 5 there."""
         return self._seen
 
-    def step(self, drawn: Int64[Tensor, "b"]) -> StepGradients:
+    def step(self, drawn: Int64[Tensor, "b"]) -> RadianceGradients:
         """Losses and gradients of a batch of rays."""
         shares = drawn.split(_SHARE)
         total = len(drawn)
@@ -108,7 +108,7 @@ class StepWorker:
             for one, two in zip(parameters, other.parameters, strict=True):
                 one += two
         rows, features = self._features(found)
-        return StepGradients(
+        return RadianceGradients(
             colour_loss=sum(one.colour_loss for one in found),
             semantic_loss=sum(one.semantic_loss for one in found),
             parameters=parameters,

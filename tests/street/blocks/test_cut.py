@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.street.blocks import Drive, DriveBlockOptions, cut_drive
+from splatseg.street.blocks import DriveBlockOptions, DriveBlocks, cut_drive
 from street.blocks.support import bend, crossing, straight
 
 
-def dense(drive: Drive, points: torch.Tensor) -> torch.Tensor:
+def dense(drive: DriveBlocks, points: torch.Tensor) -> torch.Tensor:
     """Weights as a table, a column a block."""
     out = torch.zeros(len(points), len(drive), dtype=torch.float64)
     for share in drive.shares(points):
@@ -19,7 +19,7 @@ def dense(drive: Drive, points: torch.Tensor) -> torch.Tensor:
     return out
 
 
-def reference(drive: Drive, point: torch.Tensor) -> list[float]:
+def reference(drive: DriveBlocks, point: torch.Tensor) -> list[float]:
     """The equation of `splatseg.street.blocks`, one number at a time."""
 
     def to_segment(a: torch.Tensor, b: torch.Tensor) -> float:

@@ -9,7 +9,7 @@ import torch
 
 from splatseg.errors import FileFormatError, InputError, MissingFileError, RangeError, ShapeError
 from splatseg.street import files
-from splatseg.street.blocks import Drive, DriveBlock, DriveBlockOptions, cut_drive
+from splatseg.street.blocks import DriveBlock, DriveBlockOptions, DriveBlocks, cut_drive
 from splatseg.street.field import MeshField
 from splatseg.street.files import (
     block_file,
@@ -163,4 +163,4 @@ def test_what_is_no_block_is_refused():
         DriveBlock(index=0, start=0, end=1, piece=line, span=line * math.nan)
     block = DriveBlock(index=1, start=0, end=1, piece=line, span=line)
     with pytest.raises(InputError, match=r"blocks: expected blocks that count from 0, got \[1\]"):
-        Drive(blocks=(block,), overlap=1.0, reach=1.0)
+        DriveBlocks(blocks=(block,), overlap=1.0, reach=1.0)

@@ -20,7 +20,7 @@ from splatseg.io.scene_fields import (
 from splatseg.io.scene_folder import work_on_scene
 from splatseg.render import BackendName
 from splatseg.street.block_field import DriveField
-from splatseg.street.blocks import Drive, cut_drive, frame_centres
+from splatseg.street.blocks import DriveBlocks, cut_drive, frame_centres
 from splatseg.street.build import DnmpOptions
 from splatseg.street.files import (
     build_blocks,
@@ -170,7 +170,7 @@ def street_drive(
 
 def _begun(
     root: Path,
-    drive: Drive,
+    drive: DriveBlocks,
     parts: BlockParts,
     name: str,
     about: Mapping[str, Any],
@@ -200,7 +200,11 @@ def _of_others(folder: Path, about: Mapping[str, Any]) -> str:
 
 
 def _build(
-    drive: Drive, folder: Path, parts: BlockParts, about: Mapping[str, Any], observer: Observer
+    drive: DriveBlocks,
+    folder: Path,
+    parts: BlockParts,
+    about: Mapping[str, Any],
+    observer: Observer,
 ) -> None:
     """Make the blocks that lack; who interrupts it is told how to go on."""
     if (folder / DRIVE_FILE).is_file():
