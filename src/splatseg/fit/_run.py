@@ -40,6 +40,12 @@ from splatseg.fit._views import Exposure, ViewModules
 from splatseg.render import Backend, default_options, get_backend
 
 
+_RECORD_EVERY = 50  # steps
+# Noise and the penalty on scales are tuned for a scene of this size (`scene_size`) and scaled to
+# others. In millimetres, unscaled, the noise moved four of five Gaussians out of all views.
+_REFERENCE_SIZE = 3.0
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FitRecord:
     """Means over some consecutive steps of a fit."""
@@ -451,15 +457,3 @@ def _write_checkpoint(run: FitRun, clock: CheckpointClock | None) -> None:
     if clock is not None:
         seconds = clock.write(run.state())
         run.stages["checkpoint"] = run.stages.get("checkpoint", 0.0) + seconds
-
-
-# One fit in progress: its state, and its steps around the shared `TrainingStep`.
-
-
-_RECORD_EVERY = 50  # steps
-# Noise and the penalty on scales are tuned for a scene of this size (`scene_size`) and scaled to
-# others. In millimetres, unscaled, the noise moved four of five Gaussians out of all views.
-_REFERENCE_SIZE = 3.0
-
-
-# Progress and result of a fit: after a step, over some steps, and at its end.

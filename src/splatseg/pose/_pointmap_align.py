@@ -311,7 +311,7 @@ def _distance(state: Aligned, pairs: Tensor, points: Tensor, target: Tensor) -> 
 # scales are divided by their geometric mean in every step, so that their product is one. Settings
 # are those of DUSt3R's code: 300 steps, a rate of 0.01 that falls to 1e-6 along a cosine, betas
 # 0.9 and 0.9, logarithms of depth, focal length (20 times the rate) and scale, confidences as
-# their logarithms. It works on the sampled pixels, as `_align` does.
+# their logarithms. It works on the sampled pixels, as `align` does.
 
 
 _RATE = 0.01

@@ -48,9 +48,6 @@ from splatseg.pose._saved import (
 )
 from splatseg.pose._video import check_video, is_video, take_frames
 
-# Runs the process that works with pycolmap, and ends it with this one.
-
-
 _LOG_LINES = 3
 
 
@@ -143,9 +140,6 @@ def _failure(status: int, log: Path) -> str:
     ]
     last = "; ".join(lines[-_LOG_LINES:]) or "it said nothing"
     return f"structure from motion ended with status {status}: {last} (all of it is in {log})."
-
-
-# Photographs or a video in, a capture with cameras and start points out.
 
 
 _FEW_FEATURES = 100

@@ -427,8 +427,6 @@ def _end_with_parent() -> None:
 
 
 # A reconstruction of pycolmap: judged, freed of what is doubtful, and scaled to photographs.
-#
-# Part of the process that works with pycolmap; see `splatseg.pose._worker`.
 
 
 # A photograph that sees fewer of the points than this has no pose worth keeping.

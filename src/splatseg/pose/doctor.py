@@ -251,9 +251,6 @@ def _estimate_figures(estimate: IntrinsicsEstimate) -> dict[str, Any]:
     }
 
 
-# The examination of a capture, from matches to a diagnosis.
-
-
 # So many photographs that are not there are named.
 _NAMED = 5
 

@@ -113,9 +113,6 @@ def solve(
     return refine(samples, aligned, progress=percent(1))
 
 
-# Photographs and a network of pointmaps in, a capture with cameras and a dense cloud out.
-
-
 _LONGEST_OF_COLOURS = 1600
 _MIN_WEIGHT = 0.1
 """A pair that is believed less is called contradictory."""

@@ -371,7 +371,7 @@ def angles_between(a: Float[Tensor, "*n 4"], b: Float[Tensor, "*n 4"]) -> Float[
     return 4 * torch.asin((chord / 2).clamp(max=1.0))
 
 
-# Uniform cubic B-splines over poses, see `render.paths`.
+# Uniform cubic B-splines over poses.
 
 
 _SAMPLES_PER_SPAN = 32

@@ -311,7 +311,7 @@ def render(
 
     with :math:`\alpha_i(p) = \min(0.99, o_i e^{-q_i(p) / 2})` and q the squared Mahalanobis
     distance to the projected Gaussian (Kerbl et al. 2023, eq. 3 and appendix C). Constants are
-    in `render._constants`, conventions in ``docs/conventions.md``.
+    in `render._values`, conventions in ``docs/conventions.md``.
 
     Differentiable in torch towards the signal, and towards means, rotations, scales, opacities,
     spherical harmonics and ``camera.cam_from_world`` where they require a gradient.

@@ -268,7 +268,7 @@ def _narrow(tensor: Tensor) -> Tensor:
 # Mesh fields of the blocks of a drive in a folder: made one by one, read when they are needed.
 #
 # FOLDER/drive.json          how the drive was cut, and what the blocks are made from
-# FOLDER/0000.safetensors    the field of block 0, see `splatseg.street.files`
+# FOLDER/0000.safetensors    the field of block 0
 
 
 DRIVE_FORMAT = "splatseg.street.drive"

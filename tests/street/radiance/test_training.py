@@ -1,6 +1,7 @@
-"""Training: it learns what there is, masks and missing labels count, and bits repeat."""
+"""Training of colours and classes: rays, kept hits, steps."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -9,14 +10,15 @@ import pytest
 import torch
 from PIL import Image
 
-from splatseg.core import View
+from splatseg.core import LabelMap, View
 from splatseg.errors import InputError, RangeError
-from splatseg.io.evidence import create_evidence, open_evidence
-from splatseg.street.hits import MeshCaster
+from splatseg.io.evidence import create_evidence, open_evidence, save_label_map
+from splatseg.street.hits import MeshCaster, MeshHits
 from splatseg.street.primitives import PrimitiveMesh
 from splatseg.street.radiance import RadianceOptions
 from splatseg.street.radiance_rendering import render_view
 from splatseg.street.radiance_training import RadianceFit, train_radiance
+from splatseg.street.training_rays import CachedHits, cached_hits, label_ids, training_rays
 from street.radiance.scene import COLOURS, IDS, SMALL, labels, photograph, truth, two_balls, views
 
 
@@ -259,3 +261,110 @@ def test_what_rays_saw_is_their_weights(tmp_path: Path) -> None:
     ahead = vertices[:42, 2] < -0.5
     assert centre[2] < 0
     assert float(fit.seen[:42][ahead].mean()) > float(fit.seen[:42][~ahead].mean())
+
+
+# Pixels as rays: directions of any lens, label maps of any size, ids without a table.
+
+
+def test_directions_are_those_of_the_cameras_lens_included() -> None:
+    bent = [
+        replace(view, camera=replace(view.camera, model="opencv", distortion=(0.1 * i, 0.01)))
+        for i, view in enumerate(views())
+    ]
+    rays = training_rays(bent, None, IDS, read=lambda _: torch.ones(8, 12, 3))
+    assert len(rays) == 288
+    found = rays.directions(torch.arange(288))
+    expected = []
+    for i, view in enumerate(bent):
+        all_directions = view.camera.rays()[1].reshape(-1, 3)
+        expected.append(all_directions[rays.pixels[96 * i : 96 * i + 96].long()])
+        assert torch.allclose(rays.view_directions(i), expected[-1], atol=1e-12)
+    assert torch.allclose(found.double(), torch.cat(expected), atol=1e-6)
+    assert len(rays.planes) == 3 * 96
+
+
+def test_one_lens_is_kept_once() -> None:
+    one = training_rays(views(), None, IDS, read=photograph)
+    assert len(one.planes) == 96
+    assert bool((one.columns == -1).all())
+
+
+def test_label_maps_of_another_size_are_read_at_centres_of_pixels(tmp_path: Path) -> None:
+    folder = create_evidence(tmp_path / "labels", kind="labels")
+    small = torch.tensor([[IDS[0], IDS[1]], [IDS[2], -1]])
+    save_label_map(LabelMap(ids=small), folder, "view0")
+    evidence = open_evidence(folder)
+    assert label_ids(views(), evidence) == tuple(sorted(IDS))
+    rays = training_rays(views()[:1], evidence, IDS, read=photograph)
+    columns = rays.columns.view(8, 12)
+    assert columns[:4, :6].unique().tolist() == [0]
+    assert columns[:4, 6:].unique().tolist() == [1]
+    assert columns[4:, :6].unique().tolist() == [2]
+    assert columns[4:, 6:].unique().tolist() == [-1]
+
+
+# Hits that are kept: compressed within the step, in files as in memory.
+
+
+def found() -> list[MeshHits]:
+    rng = torch.Generator().manual_seed(0)
+    caster = MeshCaster(two_balls())
+    directions = torch.randn(90, 3, generator=rng) * 0.3 + torch.tensor([0.0, 0, 1])
+    return [
+        caster.hits(torch.tensor([0.0, 0, -5]), part, max_hits=4) for part in directions.split(40)
+    ]
+
+
+def same_hits(one: CachedHits, two: CachedHits) -> bool:
+    return (
+        torch.equal(one.starts, two.starts)
+        and np.array_equal(one.faces, two.faces)
+        and np.array_equal(one.weights, two.weights)
+    )
+
+
+def test_hits_come_back_ray_by_ray_within_a_step_of_their_weights() -> None:
+    parts = found()
+    kept = cached_hits(parts, memory=1 << 20)
+    rays = torch.tensor([80, 3, 3, 41])
+    places, faces, weights = kept.of(rays, 4)
+    all_faces = torch.cat([part.faces for part in parts])[rays].reshape(-1)
+    all_weights = torch.cat([part.weights for part in parts])[rays].reshape(-1, 3)
+    assert torch.equal(places, (all_faces >= 0).nonzero()[:, 0])
+    assert torch.equal(faces, all_faces[places])
+    assert float((weights - all_weights[places]).abs().max()) < 2 / 65535
+    assert torch.allclose(weights.sum(dim=1), torch.ones(len(weights)), atol=1e-5)
+    assert kept.folder is None
+    assert kept.nbytes == 8 * kept.hits
+
+
+@pytest.mark.parametrize("memory", [0, 500])
+def test_in_files_they_are_the_same_as_in_memory(memory: int) -> None:
+    in_files = cached_hits(found(), memory=memory)
+    assert same_hits(cached_hits(found(), memory=1 << 20), in_files)
+    assert in_files.folder is not None
+    assert in_files.folder.is_dir()
+    in_files.close()
+    assert not in_files.folder.exists()
+
+
+@pytest.mark.parametrize("memory", [0, 1 << 20])
+def test_rays_that_meet_nothing_have_no_hits(memory: int) -> None:
+    none = [MeshCaster(two_balls()).hits(torch.tensor([0.0, 0, -5]), torch.tensor([[0.0, 1, 0]]))]
+    for parts in (none, []):
+        kept = cached_hits(parts, memory=memory)
+        assert kept.hits == 0
+        assert len(kept.starts) == len(parts) + 1
+        kept.close()
+
+
+def test_a_fault_on_the_way_leaves_no_files(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+
+    def parts() -> Iterator[MeshHits]:
+        yield from found()
+        raise RuntimeError("stopped")
+
+    with pytest.raises(RuntimeError, match="stopped"):
+        cached_hits(parts(), memory=0)
+    assert list(tmp_path.iterdir()) == []
