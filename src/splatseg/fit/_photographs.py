@@ -68,7 +68,7 @@ class TrainingPhotographs:
         self._cameras = [undistorted_camera(image_camera(view, longest)) for view in self._views]
 
     @classmethod
-    def of(cls, views: Sequence[View], *, options: FitOptions) -> "Photographs":
+    def of(cls, views: Sequence[View], *, options: FitOptions) -> "TrainingPhotographs":
         """The photographs of views with the options of a fit."""
         return cls(
             views,

@@ -39,7 +39,6 @@ from splatseg.fit._step import Loss, StepGradients, StepSettings, TrainingStep
 from splatseg.fit._views import Exposure, ViewModules
 from splatseg.render import Backend, default_options, get_backend
 
-
 _RECORD_EVERY = 50  # steps
 # Noise and the penalty on scales are tuned for a scene of this size (`scene_size`) and scaled to
 # others. In millimetres, unscaled, the noise moved four of five Gaussians out of all views.

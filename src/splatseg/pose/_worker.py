@@ -79,7 +79,7 @@ class FoundModel:
     seconds: float
 
     @staticmethod
-    def of(mapper: str, found: Sequence[Any], seconds: float) -> "Model":
+    def of(mapper: str, found: Sequence[Any], seconds: float) -> "FoundModel":
         """The result of a mapper, without photographs that see too few points."""
         for reconstruction in found:
             _drop_doubtful(reconstruction)
