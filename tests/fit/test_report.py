@@ -179,5 +179,5 @@ def test_too_short_for_a_curve_and_poses_that_were_found(fitted) -> None:
         assert expected in words
     assert "<odd>" not in text
     assert json.loads((root / "reports" / "fit.json").read_text())["poses"] == json.loads(
-        json.dumps(report)
+        json.dumps(asdict(report))
     )

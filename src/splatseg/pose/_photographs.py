@@ -83,10 +83,6 @@ class WorkingLens:
     images: dict[str, str]
     """File name of the photograph by file name of the working copy."""
 
-    def as_json(self) -> dict[str, Any]:
-        """For the job of the worker."""
-        return {name: getattr(self, name) for name in self.__slots__}
-
 
 def find_photographs(folder: Path) -> tuple[Path, ...]:
     """Photographs in a folder or its folder ``images``, sorted by name.

@@ -204,15 +204,8 @@ def load_capture(model: Path, photographs: Sequence[Path], *, root: Path) -> Cap
         for id, image in colmap.images.items()
     ]
     capture = build_capture(root, raw, format="sfm", points=colmap.points)
-    return capture if capture.up is not None else _with_up(capture)
-
-
-def _with_up(capture: Capture) -> Capture:
-    """The capture with the direction that its photographers held up."""
-    from dataclasses import replace
-
     poses = np.stack([view.camera.cam_from_world.numpy() for view in capture.views])
-    return replace(capture, up=estimated_up(poses[:, :3, :3]))
+    return replace(capture, up=capture.up or estimated_up(poses[:, :3, :3]))
 
 
 def estimated_up(rotations: np.ndarray[Any, np.dtype[np.float64]]) -> tuple[float, float, float]:

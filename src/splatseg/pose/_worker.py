@@ -17,6 +17,7 @@ import sys
 import threading
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -85,15 +86,11 @@ class FoundModel:
             _drop_doubtful(reconstruction)
         kept = [r for r in found if r.num_reg_images() >= 2 and r.num_points3D() > 0]
         kept.sort(key=lambda r: (-r.num_reg_images(), r.compute_mean_reprojection_error()))
-        if not kept:
-            return FoundModel(
-                mapper=mapper, reconstructions=(), registered=0, error=0.0, seconds=seconds
-            )
         return FoundModel(
             mapper=mapper,
             reconstructions=tuple(kept),
-            registered=int(kept[0].num_reg_images()),
-            error=float(kept[0].compute_mean_reprojection_error()),
+            registered=int(kept[0].num_reg_images()) if kept else 0,
+            error=float(kept[0].compute_mean_reprojection_error()) if kept else 0.0,
             seconds=seconds,
         )
 
@@ -174,16 +171,13 @@ class WorkerJob:
 
     def _write_lenses(self) -> list[int]:
         """Ids of the lenses in the database, which gets them in the first run."""
-        database = pycolmap.Database.open(self._database)
-        try:
+        with closing(pycolmap.Database.open(self._database)) as database:
             there = sorted(camera.camera_id for camera in database.read_all_cameras())
             if len(there) == len(self._lenses):
                 return there
             # New, or stopped while they were written: no feature was found before they were.
             database.clear_all_tables()
             return [database.write_camera(_camera(lens)) for lens in self._lenses]
-        finally:
-            database.close()
 
     # -- matches ----------------------------------------------------------------------------
 
@@ -219,15 +213,12 @@ class WorkerJob:
                 strength[i] += inliers
         weak = [pair for pair in verified if min(strength[i] for i in pair) < _WEAK]
         weak = sorted(sorted(weak, key=lambda pair: -verified[pair])[:_MAX_GUIDED_PAIRS])
-        database = pycolmap.Database.open(self._database)
-        try:
+        with closing(pycolmap.Database.open(self._database)) as database:
             ids = {image.name: image.image_id for image in database.read_all_images()}
             for pair in weak:
                 a, b = (ids[self._names[i]] for i in pair)
                 database.delete_matches(a, b)
                 database.delete_two_view_geometry(a, b)
-        finally:
-            database.close()
         # Should this be stopped now, the next run finds them missing and matches them anew.
         self._match_pairs(weak, guided=True)
 
@@ -256,22 +247,16 @@ class WorkerJob:
             _tell("matches", done, len(pairs))
 
     def _descriptors(self) -> list[np.ndarray[Any, np.dtype[np.uint8]]]:
-        database = pycolmap.Database.open(self._database)
-        try:
+        with closing(pycolmap.Database.open(self._database)) as database:
             ids = {image.name: image.image_id for image in database.read_all_images()}
             return [np.asarray(database.read_descriptors(ids[n]).data) for n in self._names]
-        finally:
-            database.close()
 
     def _verified(self) -> dict[tuple[int, int], int]:
         """How many matches say that two photographs show the same, by their places."""
-        database = pycolmap.Database.open(self._database)
-        try:
+        with closing(pycolmap.Database.open(self._database)) as database:
             index_of = {name: i for i, name in enumerate(self._names)}
             index_of_id = {i.image_id: index_of[i.name] for i in database.read_all_images()}
             pair_ids, inliers = database.read_two_view_geometry_num_inliers()
-        finally:
-            database.close()
         verified: dict[tuple[int, int], int] = {}
         for pair_id, count in zip(pair_ids, inliers, strict=True):
             a, b = (index_of_id[id] for id in pycolmap.pair_id_to_image_pair(pair_id))
@@ -373,8 +358,7 @@ class WorkerJob:
     def _photographs(self) -> dict[str, dict[str, int]]:
         """Features and verified pairs of every photograph."""
         pairs = self._verified()
-        database = pycolmap.Database.open(self._database)
-        try:
+        with closing(pycolmap.Database.open(self._database)) as database:
             return {
                 image.name: {
                     "features": int(database.num_keypoints_for_image(image.image_id)),
@@ -385,8 +369,6 @@ class WorkerJob:
                 }
                 for image in database.read_all_images()
             }
-        finally:
-            database.close()
 
 
 def _members(best: FoundModel) -> list[list[str]]:
@@ -443,10 +425,6 @@ def model_facts(reconstruction: Any) -> dict[str, Any]:
         "points": int(reconstruction.num_points3D()),
         "error": float(reconstruction.compute_mean_reprojection_error()),
         "track_length": float(reconstruction.compute_mean_track_length()),
-        "observations": {
-            reconstruction.image(id).name: int(reconstruction.image(id).num_points3D)
-            for id in reconstruction.reg_image_ids()
-        },
     }
 
 
