@@ -7,5 +7,5 @@ compares everything with everything.
 from splatseg.neighbours._index import NeighbourIndex as NeighbourIndex
 from splatseg.neighbours._index import NeighbourLists as NeighbourLists
 from splatseg.neighbours._index import Neighbours as Neighbours
+from splatseg.neighbours._index import Subset as Subset
 from splatseg.neighbours._index import ball_means as ball_means
-from splatseg.neighbours._subset import Subset as Subset

@@ -9,7 +9,12 @@ from torch import Tensor
 
 from splatseg.pose._pointmap_align import Aligned, normalised, place_pairs
 from splatseg.pose._pointmap_pixels import PairSamples
-from splatseg.pose._pointmap_start import geman_mcclure, ray_directions, rotation_of_vector
+from splatseg.pose._pointmap_start import (
+    cross_matrix,
+    geman_mcclure,
+    ray_directions,
+    rotation_of_vector,
+)
 
 MIN_DEPTH_SHARE = 0.02
 """A point nearer to its camera than this share of its depth counts as behind it."""
@@ -204,9 +209,9 @@ def _by_pose(
     shape = (*second.shape, 3)
     eye = torch.eye(3, dtype=torch.float64)
     parts = (
-        -turn @ _cross(scaled),
+        -turn @ cross_matrix(scaled),
         turn.expand(shape),
-        _cross(second),
+        cross_matrix(second),
         -eye.expand(shape),
         turn @ scaled.unsqueeze(-1),
     )
@@ -260,14 +265,6 @@ def _projected(camera: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3 3"]:
     z = torch.where(z.abs() < 1e-9, 1e-9, z)
     zero, inverse = torch.zeros_like(z), 1 / z
     rows = (inverse, zero, -x / z**2, zero, inverse, -y / z**2, zero, zero, inverse)
-    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
-
-
-def _cross(vector: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3 3"]:
-    """The matrix of the cross product with a vector."""
-    x, y, z = vector.unbind(-1)
-    zero = torch.zeros_like(x)
-    rows = (zero, -z, y, z, zero, -x, -y, x, zero)
     return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
 
 

@@ -344,10 +344,15 @@ def rotation_vector(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*ba
 
 def rotation_of_vector(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
     """Rotations about axes by their length, radians. Inverse of `rotation_vector`."""
+    return torch.linalg.matrix_exp(cross_matrix(vector))
+
+
+def cross_matrix(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """The matrix of the cross product with a vector."""
     x, y, z = vector.unbind(-1)
     zero = torch.zeros_like(x)
     rows = (zero, -z, y, z, zero, -x, -y, x, zero)
-    return torch.linalg.matrix_exp(torch.stack(rows, dim=-1).reshape(*x.shape, 3, 3))
+    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
 
 
 # All pairs at once: rotations, depths and centres by averaging over the graph.

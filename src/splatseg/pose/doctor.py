@@ -74,12 +74,12 @@ _ESTIMATED = 3
 _POINT_VIEWS, _POINT_LONGEST = 20, 320
 
 
-def fits(score: PointAgreement) -> bool:
+def _fits(score: PointAgreement) -> bool:
     """Whether start points fit the cameras."""
     return score.value >= (POINTS_FIT_COLOURS if score.position is None else POINTS_FIT)
 
 
-def examine(
+def _examine(
     capture: Capture, views: Sequence[View], matches: ViewMatches, findings: Findings
 ) -> tuple[CameraCorrection, PointEvidence]:
     """Hold the cameras, and every correction of a usual fault, against the matches.
@@ -87,7 +87,7 @@ def examine(
     Returns:
         What corrects the cameras, and what points can be held against then.
     """
-    photographs = photographs_of_points(matches, views)
+    photographs = _photographs_of_points(matches, views)
     findings.figures.update(
         {
             "photographs": len(np.unique(matches.views)),
@@ -122,7 +122,7 @@ def examine(
     return correction, _point_evidence(evidence, correction, views, photographs)
 
 
-def photographs_of_points(matches: ViewMatches, views: Sequence[View]) -> ReducedPhotographs:
+def _photographs_of_points(matches: ViewMatches, views: Sequence[View]) -> ReducedPhotographs:
     """Small photographs to hold points against, of some of the views that were matched."""
     used = np.unique(matches.views) if len(matches) else np.arange(len(views))
     chosen = used[np.linspace(0, len(used) - 1, min(_POINT_VIEWS, len(used))).round().astype(int)]
@@ -139,7 +139,7 @@ def _choose(
     none = no_correction()
     given = Scored(correction=none, agreement=evidence.agreement(none))
     as_given = _points_under(capture, views, evidence, none, photographs)
-    if given.agreement >= AGREEING and (as_given is None or fits(as_given)):
+    if given.agreement >= AGREEING and (as_given is None or _fits(as_given)):
         return none, given
     plain = search_cameras(evidence, world_axes=flipped_world(capture.format))
     fitted = [
@@ -155,7 +155,7 @@ def _choose(
 
     def worth(candidate: Scored) -> tuple[bool, int, float]:
         score = _points_under(capture, views, evidence, candidate.correction, photographs)
-        fit = score is not None and fits(score)
+        fit = score is not None and _fits(score)
         return fit, -candidate.correction.faults, candidate.agreement
 
     # Candidates that matches cannot tell apart (a camera that only moves forward may roll) are
@@ -305,9 +305,9 @@ def diagnose(
     if matches is None:
         matches = match_views(views, max_views=checked.max_views, longest=_LONGEST)
     findings = Findings(faults=list(found), doubts=_missing(capture))
-    correction, evidence = examine(capture, views, matches, findings)
+    correction, evidence = _examine(capture, views, matches, findings)
     corrected = judge_points(
-        _corrected(capture, correction), evidence, findings, declared=declared, fits=fits
+        _corrected(capture, correction), evidence, findings, declared=declared, fits=_fits
     )
     corrected = judge_up(corrected, findings)
     helpless = any(
@@ -353,10 +353,10 @@ def find_points(
     if len(matches) < MIN_MATCHES:
         return None
     evidence = match_evidence(matches, [view.camera for view in views])
-    photographs = photographs_of_points(matches, views)
+    photographs = _photographs_of_points(matches, views)
     held = _point_evidence(evidence, no_correction(), views, photographs)
-    best = search_points(held, cloud, fits=fits)
-    return best.correction if fits(best.score) else None
+    best = search_points(held, cloud, fits=_fits)
+    return best.correction if _fits(best.score) else None
 
 
 def _corrected(capture: Capture, correction: CameraCorrection) -> Capture:

@@ -1,5 +1,6 @@
 """From points, depth, photographs and label maps to a mesh field: the paper's two stages."""
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
@@ -46,7 +47,7 @@ class DnmpOptions:
     """fast: networks and rates for two cores. published: those of the papers. What is given below
     counts before it."""
 
-    voxels: tuple[Positive, ...] = (0.5, 1.0)
+    voxels: tuple[float, ...] = (0.5, 1.0)
     """Sides of the voxels of the levels, metres."""
 
     geometry_iterations: Natural | None = None
@@ -76,8 +77,8 @@ class DnmpOptions:
     rays saw of it, 0.01 at least. all: all alike. None is weighed, or adjusted with published."""
 
     def __post_init__(self) -> None:
-        if not self.voxels:
-            raise RangeError("voxels: expected at least one length in metres, got none.")
+        if not self.voxels or not all(0 < side < math.inf for side in self.voxels):
+            raise RangeError(f"voxels: expected positive lengths in metres, got {self.voxels}.")
 
     @property
     def geometry(self) -> GeometryOptions:

@@ -227,7 +227,7 @@ def voxel_primitives(
         InputError: If there are no points.
 
     Example:
-        >>> from splatseg.street.shapes import load_shapes
+        >>> from splatseg.street.shape_files import load_shapes
         >>> made = voxel_primitives(torch.tensor([[0.1, 0.1, 0.1], [0.9, 0.1, 0.1]]),
         ...                         shapes=load_shapes())
         >>> made.levels.tolist()
