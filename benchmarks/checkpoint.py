@@ -12,14 +12,10 @@ import time
 from pathlib import Path
 
 import torch
-
-from splatseg.fit._checkpoint import (
-    Checkpoint,
-    read_checkpoint,
-    write_checkpoint,
-)
 from splatseg.fit._state import FitState
-from splatseg.io.arrays import discard_checkpoint_file
+from splatseg.io.npz_writing import discard_checkpoint_file
+
+from splatseg.fit._checkpoint import read_checkpoint, write_checkpoint
 
 _WIDTHS = {"means": 3, "log_scales": 3, "rotations": 4, "logits": 1, "sh": 48}
 
@@ -35,7 +31,7 @@ def main() -> None:
         for group in ("parameters", "first", "second")
         for name, width in _WIDTHS.items()
     }
-    checkpoint = Checkpoint(state=FitState(tensors=tensors, content={}), identity={})
+    checkpoint = FitState(tensors=tensors, content={})
     path = arguments.folder / "checkpoint.npz"
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     for _ in range(3):

@@ -32,8 +32,7 @@ from splatseg.core import Camera, Gaussians
 from splatseg.core.rigid import rotation_from_quaternion
 from splatseg.errors import SplatsegError
 from splatseg.render import RenderOptions, get_backend
-from splatseg.render.cuda import CudaBackend
-from splatseg.render.cuda._view import CudaView, colours
+from splatseg.render.cuda import CudaBackend, CudaView, colours
 
 OPTIONS = RenderOptions(alpha_max=0.999)
 COLUMNS = ("means", "rotations", "scales", "opacities", "sh")

@@ -19,8 +19,8 @@ from pathlib import Path
 
 from splatseg.core import Capture
 from splatseg.evaluate import evaluate_photographs
-from splatseg.fit import FitOptions, _loop, _run, _step
-from splatseg.fit._photographs import Photographs
+from splatseg.fit import FitOptions, _run, _step
+from splatseg.fit._photographs import TrainingPhotographs
 from splatseg.io.captures import read_capture
 from splatseg.lift import GaussianField
 from splatseg.render import get_backend
@@ -70,11 +70,11 @@ def main() -> None:
         module.time = type("Clocks", (), {"monotonic": clock.now, "perf_counter": clock.now})
     print(f"{platform.processor() or platform.machine()}, {threads()} threads, {isa()}, {options}")
 
-    photographs = Photographs.of(capture.train_views, options=options)
+    photographs = TrainingPhotographs.of(capture.train_views, options=options)
     marks = sorted({*arguments.marks, arguments.minutes})
     run = _run.FitRun(capture, options, get_backend("cpu"), photographs)
     before, steps, last = dict(run.stages), 0, (0, 0.0)
-    with _loop.one_torch_thread():
+    with _run.one_torch_thread():
         for mark in marks:
             while not run.finished and run.seconds < 60 * mark:
                 status = run.step()

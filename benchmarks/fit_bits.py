@@ -134,7 +134,7 @@ def measured(capture: Capture, folder: Path) -> dict[str, dict[str, str]]:
     for name, options in VARIANTS.items():
         checkpoints = Checkpoints(path=folder / "checkpoint.npz", at_end=True)
         result = fit(capture, options=options, backend="cpu", checkpoints=checkpoints)
-        tensors = read_checkpoint(checkpoints.path).state.tensors
+        tensors = read_checkpoint(checkpoints.path).tensors
         found[name] = {
             "state": digest(tensors[key] for key in sorted(tensors)),
             "result": of_gaussians(result.gaussians),

@@ -16,6 +16,7 @@ is what a quiet machine would show, and of the wall.
 import argparse
 import platform
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -25,11 +26,11 @@ from splatseg.core import Camera
 from splatseg.core.rigid import rotation_from_quaternion
 from splatseg.core.sh import evaluate_sh
 from splatseg.fit import FitOptions
-from splatseg.fit._loop import one_torch_thread
-from splatseg.fit._loss import l1_dssim
+from splatseg.fit._options import COLOUR_RATE, OPACITY_RATE, RATES, ROTATION_RATE
 from splatseg.fit._parameters import Parameters
-from splatseg.fit._photographs import Photographs
-from splatseg.fit._run import FitRun
+from splatseg.fit._photographs import TrainingPhotographs
+from splatseg.fit._run import FitRun, one_torch_thread
+from splatseg.fit._step import l1_dssim
 from splatseg.io.captures import read_capture
 from splatseg.render import default_options, get_backend, render
 from splatseg.render.cpu import isa, set_threads
@@ -72,12 +73,12 @@ class Slow:
         self.leaves["harmonics"] = rest.detach().clone().requires_grad_()
         del self.leaves["sh"]
         rates = {
-            "means": options.position_rate * extent,
-            "log_scales": options.scale_rate,
-            "rotations": options.rotation_rate,
-            "logits": options.opacity_rate,
-            "mean_colour": options.colour_rate,
-            "harmonics": options.colour_rate / 20,
+            "means": RATES["fast"].position * extent,
+            "log_scales": RATES["fast"].scale,
+            "rotations": ROTATION_RATE,
+            "logits": OPACITY_RATE,
+            "mean_colour": COLOUR_RATE,
+            "harmonics": COLOUR_RATE / 20,
         }
         groups = [{"params": [self.leaves[name]], "lr": rate} for name, rate in rates.items()]
         self.optimiser = torch.optim.Adam(groups, eps=1e-15)
@@ -257,10 +258,13 @@ def main() -> None:
     capture = read_capture(arguments.data)
     options = FitOptions(
         minutes=None, steps=10 * (arguments.before + arguments.our_steps),
-        max_gaussians=arguments.gaussians, background="black", noise=0.0, quarter_until=0.0,
-        half_until=0.0, sh_degree_interval=1e-9, grow_until=0.05,
+        max_gaussians=arguments.gaussians, background="black", noise=0.0,
     )  # fmt: skip
-    photographs = Photographs(capture.train_views, longest=options.longest)
+    # All at once: full size, all harmonics.
+    RATES["fast"] = replace(
+        RATES["fast"], quarter_until=0.0, half_until=0.0, sh_degree_interval=1e-9
+    )
+    photographs = TrainingPhotographs(capture.train_views, longest=options.longest)
     run = FitRun(capture, options, get_backend("cpu"), photographs)
     with one_torch_thread():
         for _ in range(arguments.before):

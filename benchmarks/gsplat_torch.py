@@ -18,7 +18,7 @@ import torch
 from gsplat.cuda import _torch_impl
 from torch import Tensor
 
-from splatseg.core import Camera
+from splatseg.core import Camera, Gaussians
 from splatseg.render import RenderOptions
 from splatseg.render.cpu import CpuView, isa, set_threads
 
@@ -112,21 +112,23 @@ def main() -> None:
     )  # fmt: skip
     # The poses are float32 and not quite rigid; gsplat takes them as they are, and so do we here.
     object.__setattr__(camera, "cam_from_world", torch.from_numpy(scene["viewmats"][0]).double())
-    cloud = [torch.from_numpy(scene[k]) for k in ("means", "quats", "scales", "opacities")]
+    names = {"means": "means", "rotations": "quats", "scales": "scales", "opacities": "opacities"}
+    columns = {name: torch.from_numpy(scene[key]) for name, key in names.items()}
+    cloud = Gaussians(**columns, sh=torch.zeros(len(columns["means"]), 1, 3))
     colours = torch.from_numpy(scene["rgb"])
     best = float("inf")
     ours = image
     for _ in range(20):
         begin = time.process_time()
-        with CpuView(*cloud, camera=camera, options=OPTIONS, signal=colours) as view:
-            ours = view.render()[0]
+        with CpuView(cloud, camera, OPTIONS) as view:
+            ours = view.draw(colours)[0]
         best = min(best, time.process_time() - begin)
     error = (ours - image).abs()
     total = sum(seconds)
     names = ("projection", "tile lists", "pair lists", "sums")
     print(", ".join(f"{name} {s:.2f} s" for name, s in zip(names, seconds, strict=True)))
     print(
-        f"garden, {len(cloud[0])} Gaussians, {width}x{height}, one thread: gsplat's PyTorch "
+        f"garden, {len(cloud)} Gaussians, {width}x{height}, one thread: gsplat's PyTorch "
         f"reference {total:.2f} s, ours ({isa()}) {best * 1e3:.1f} ms, ratio {total / best:.0f}; "
         f"largest difference {float(error.max()):.1e}, mean {float(error.mean()):.1e}"
     )

@@ -22,10 +22,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from splatseg.core import Camera
+from splatseg.core import Camera, Gaussians
 from splatseg.render import RenderOptions
-from splatseg.render.cpu import CpuView, isa, set_threads
-from splatseg.render.cpu._view import padded_channels
+from splatseg.render.cpu import CpuView, isa, padded_channels, set_threads
 
 PROTOTYPE = Path(__file__).resolve().parents[2] / "shared" / "prototype" / "kernels"
 DATA = PROTOTYPE.parents[1] / "data"
@@ -91,13 +90,18 @@ def measure(name: str, rs: Any, scenes: Any, repeats: int) -> dict[str, Any]:
     pose = torch.from_numpy(scene["viewmats"][0])
     # The scene's poses are float32 and not quite rigid; the kernels take them as they are.
     object.__setattr__(camera, "cam_from_world", pose.double())
-    cloud = [torch.from_numpy(scene[k]) for k in ("means", "quats", "scales", "opac")]
+    harmonics = torch.zeros(n, 16, 3)
+    names = {"means": "means", "rotations": "quats", "scales": "scales", "opacities": "opac"}
+    cloud = Gaussians(
+        **{name: torch.from_numpy(scene[key]) for name, key in names.items()}, sh=harmonics
+    )
     colours = torch.from_numpy(scene["colors"])
     options = RenderOptions()
     rng = np.random.default_rng(0)
 
     def prepare() -> CpuView:
-        view = CpuView(*cloud, camera=camera, options=options, signal=colours)
+        view = CpuView(cloud, camera, options)
+        view._kernels(signal=colours)
         return view
 
     rows: dict[str, tuple[float, float]] = {}
@@ -115,12 +119,12 @@ def measure(name: str, rs: Any, scenes: Any, repeats: int) -> dict[str, Any]:
         lambda: prototype.rgb(scene["colors"]),
         repeats,
     )
-    view.render()
+    view.draw(colours)
     statistics = view.statistics
     out, left = prototype.rgb(scene["colors"])
     v_image = rng.standard_normal((height, width, 4)).astype(np.float32)
     v_left = rng.standard_normal((height, width)).astype(np.float32)
-    view.render(record=True)
+    view.draw(colours, record=True)
     mine = torch.from_numpy(v_image[..., :3].copy())
     planes = (
         *view._forward, mine, torch.from_numpy(v_left), torch.from_numpy(v_image[..., 3].copy())
@@ -131,9 +135,8 @@ def measure(name: str, rs: Any, scenes: Any, repeats: int) -> dict[str, Any]:
         repeats,
     )
     everything = frozenset(("means", "rotations", "scales", "opacities", "sh"))
-    harmonics = torch.zeros(n, 16, 3)
-    with_sh = CpuView(*cloud, camera=camera, options=options, sh=harmonics)
-    with_sh.render(record=True)
+    with_sh = CpuView(cloud, camera, options)
+    with_sh.draw(record=True)
     rows["backward 3D (degree 3)"] = alternate(
         lambda: with_sh.backward(mine, v_alpha=planes[4], v_depth_sum=planes[5], wanted=everything),
         None,

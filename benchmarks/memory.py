@@ -127,8 +127,8 @@ def fit_large(folder: Path) -> None:
     del start, colours
     before = peak_gb()
     options = FitOptions(
-        minutes=None, steps=24, max_gaussians=1_000_000, quarter_until=0.0, half_until=0.0,
-        densify_from=6, densify_every=6, sh_degree_interval=0.01,
+        minutes=None, steps=24, max_gaussians=1_000_000, rates="published",
+        densify_from=6, densify_every=6,
     )  # fmt: skip
     checkpoints = Checkpoints(path=folder / "checkpoint", steps=8)
     result = fit(capture, options=options, backend="cpu", checkpoints=checkpoints)

@@ -14,7 +14,7 @@ import time
 import torch
 
 from splatseg.neighbours import NeighbourIndex
-from splatseg.street.point_query import BallQuery
+from splatseg.street.field import BallQuery
 from splatseg.street.shapes import primitive_scale
 
 VERTICES = 42

@@ -13,8 +13,8 @@ from pathlib import Path
 
 from splatseg.core import Gaussians, View
 from splatseg.evaluate import evaluate_photographs
-from splatseg.fit._photographs import Photographs
-from splatseg.fit._prune import without_floaters
+from splatseg.fit._photographs import TrainingPhotographs
+from splatseg.fit._refine import without_floaters
 from splatseg.io.images import DEFAULT_LONGEST
 from splatseg.io.scene import load_scene
 from splatseg.lift import GaussianField
@@ -37,7 +37,7 @@ def main() -> None:
     for root in arguments.scenes:
         scene = load_scene(root)
         views = list(scene.test_views[:: arguments.every])
-        photographs = Photographs(scene.train_views, longest=DEFAULT_LONGEST)
+        photographs = TrainingPhotographs(scene.train_views, longest=DEFAULT_LONGEST)
         begin = time.process_time()
         pruned = without_floaters(scene.gaussians, photographs, scene.views, backend="cpu")
         seconds = time.process_time() - begin

@@ -23,8 +23,11 @@ from types import ModuleType
 import torch
 from torch import Tensor
 
-from splatseg.street.shapes import ShapeAutoEncoder, load_shapes, score_shapes
-from splatseg.street.shapes.checkpoint import SHIPPED
+from splatseg.street.shape_files import SHIPPED, load_shapes
+from splatseg.street.shapes import ShapeAutoEncoder
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+from support.shape_quality import score_shapes
 
 RECIPE = Path(__file__).parents[1] / "scripts" / "train_shapes"
 

@@ -33,30 +33,29 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image
+from splatseg.street.sources import scan_points
 from torch import Tensor
 
 from splatseg.core import Camera, Capture, LabelledMesh, LayerInfo, Scan, View
 from splatseg.io.evidence import open_evidence
 from splatseg.raycast import RayCaster
+from splatseg.street.block_field import DriveField, DriveScans, block_capture
 from splatseg.street.blocks import (
-    Drive,
     DriveBlock,
     DriveBlockOptions,
-    DriveField,
-    DriveScans,
-    block_capture,
+    DriveBlocks,
     cut_drive,
     frame_centres,
 )
+from splatseg.street.depth_views import scan_views
 from splatseg.street.field import MeshField
-from splatseg.street.geometry import GeometryOptions, fit_geometry, scan_views
+from splatseg.street.geometry import GeometryOptions, fit_geometry
 from splatseg.street.primitives import voxel_primitives
-from splatseg.street.radiance.options import RadianceOptions
-from splatseg.street.radiance.train import train_radiance
-from splatseg.street.shapes import ShapeAutoEncoder, load_shapes, sphere_code
-from splatseg.street.sources import scan_points
-from splatseg.synthetic import look_at
-from splatseg_bench.worlds import STREET_CLASSES, scene_mesh, street
+from splatseg.street.radiance import RadianceOptions
+from splatseg.street.radiance_training import train_radiance
+from splatseg.street.shape_files import load_shapes
+from splatseg.street.shapes import ShapeAutoEncoder, sphere_code
+from splatseg.synthetic import STREET_CLASSES, look_at, scene_mesh, street
 
 LAYER = "semantic"
 PIECE = 200.0
@@ -78,7 +77,6 @@ RADIANCE = RadianceOptions(
     depth=1,
     semantic_width=16,
     colour_widths=(16,),
-    background="constant",
     fine_hits=3,
     coarse_hits=0,
     rays=256,
@@ -232,7 +230,9 @@ class Recorder:
 class Maker:
     """Makes the field of a block: what `splatseg street` does of a drive, in small."""
 
-    def __init__(self, drive: Drive, capture: Capture, scans: DriveScans, road: Recorder) -> None:
+    def __init__(
+        self, drive: DriveBlocks, capture: Capture, scans: DriveScans, road: Recorder
+    ) -> None:
         self.drive, self.capture, self.scans, self.recorder = drive, capture, scans, road
         self.shapes: ShapeAutoEncoder = load_shapes()
         self.sphere = sphere_code(self.shapes)

@@ -29,29 +29,25 @@ from splatseg.io.captures import read_capture
 from splatseg.io.scans import read_scans
 from splatseg.io.scene import load_scene
 from splatseg.lift import GaussianField
-from splatseg.street.geometry import (
-    PUBLISHED_GEOMETRY,
+from splatseg.street.depth_views import (
     DepthView,
-    GeometryOptions,
-    PrimitiveCaster,
+    axis_cosines,
     field_views,
-    fit_geometry,
     point_views,
     scan_views,
 )
-from splatseg.street.geometry.depth_views import axis_cosines
+from splatseg.street.geometry import PUBLISHED_GEOMETRY, GeometryOptions, fit_geometry
+from splatseg.street.hits import PrimitiveCaster
 from splatseg.street.primitives import Primitives, voxel_primitives
-from splatseg.street.shapes import load_shapes, sphere_code
+from splatseg.street.shape_files import load_shapes
+from splatseg.street.shapes import sphere_code
 
 MAX_DEPTH = 80.0
 DEFAULT = GeometryOptions()
 ROWS = {
     "default": DEFAULT,
     "published": PUBLISHED_GEOMETRY,
-    "regularised": replace(DEFAULT, normal_weight=0.1, laplacian_weight=0.1),
     "ray": replace(DEFAULT, error="ray"),
-    "truncation": replace(DEFAULT, truncation=2.0),
-    "distance": replace(DEFAULT, distance_power=1.0),
     "carve": replace(DEFAULT, carve=0.9),
     "short": replace(DEFAULT, iterations=200),
     "long": replace(DEFAULT, iterations=1000),
@@ -170,8 +166,6 @@ def main() -> None:
     parser.add_argument("--rows", nargs="+", choices=list(ROWS), default=list(ROWS))
     parser.add_argument("--points", choices=("sfm", "scans", "both"), default="both")
     parser.add_argument("--depth", choices=("scans", "points", "both"), default="both")
-    parser.add_argument("--start", choices=("sphere", "encoded"), default="sphere")
-    parser.add_argument("--coarse", choices=("everywhere", "sparse"), default="everywhere")
     arguments = parser.parse_args()
     bench = Bench(arguments.data)
     begun = time.process_time()
@@ -182,8 +176,6 @@ def main() -> None:
         bench.points(arguments.points),
         shapes=bench.shapes,
         sphere=bench.sphere,
-        start=arguments.start,
-        coarse=arguments.coarse,
     )
     counts = torch.bincount(primitives.levels).tolist()
     print(f"primitives by level: {counts}")

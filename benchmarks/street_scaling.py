@@ -42,13 +42,9 @@ from splatseg.io.captures import read_capture
 from splatseg.io.evidence import open_evidence
 from splatseg.street.files import load_mesh_field
 from splatseg.street.hits import MeshCaster
-from splatseg.street.radiance import (
-    PUBLISHED_RADIANCE,
-    RadianceModel,
-    RadianceOptions,
-    render_view,
-    train_radiance,
-)
+from splatseg.street.radiance import PUBLISHED_RADIANCE, RadianceModel, RadianceOptions
+from splatseg.street.radiance_rendering import render_view
+from splatseg.street.radiance_training import train_radiance
 
 POSES = range(20, 34)
 RAYS = 1024

@@ -26,7 +26,6 @@ def main() -> None:
     args = parser.parse_args()
     counts: list[int] = args.threads
     scene, view_camera = room(args.gaussians, 0), camera()
-    cloud = (scene.means, scene.rotations, scene.scales, scene.opacities)
     options = RenderOptions()
     size = (view_camera.height, view_camera.width)
     signal, wide = torch.randn(len(scene), 64), torch.randn(*size, 64)
@@ -36,10 +35,12 @@ def main() -> None:
     quiet = (False,)
 
     def prepared() -> CpuView:
-        return CpuView(*cloud, camera=view_camera, options=options, sh=scene.sh)
+        view = CpuView(scene, view_camera, options)
+        view._kernels(scene.sh)
+        return view
 
     view = prepared()
-    view.render(record=True)
+    view.draw(record=True)
     forward = view._forward
 
     def adjoint() -> torch.Tensor:
@@ -79,7 +80,7 @@ def main() -> None:
             for count in counts:
                 set_threads(count)
                 if name == "backward 2D":
-                    view.render(record=True)
+                    view.draw(record=True)
                     forward = view._forward
                 begin = time.perf_counter()
                 result = call()

@@ -170,4 +170,4 @@ def test_no_public_name_hides_a_package() -> None:
         assert f"splatseg.{name}" not in sys.modules, name
     packages = {path.parent.name for path in Path(splatseg.__file__).parent.glob("*/__init__.py")}
     assert not packages & SURFACE
-    assert packages - {"cli"} == PACKAGES
+    assert packages - {"cli"} | {"raycast"} == PACKAGES  # raycast is one module

@@ -35,10 +35,10 @@ def test_sides_of_voxels_that_are_none(command, words, got, splatseg) -> None:
 @pytest.mark.parametrize(
     ("flag", "value", "got"),
     [
-        ("--radius", "-1", "expected a positive number, got -1.0"),
-        ("--radius", "nan", "expected a positive number, got nan"),
-        ("--iterations", "0", "expected 1 or more, got 0"),
-        ("--semantic-weight", "nan", "expected 0 or more, got nan"),
+        ("--radius", "-1", "expected more than 0, got -1"),
+        ("--radius", "nan", "expected more than 0, got nan"),
+        ("--iterations", "0", "expected at least 1, got 0"),
+        ("--semantic-weight", "nan", "expected at least 0, got nan"),
     ],
 )
 def test_other_numbers_of_nested_options(flag, value, got, splatseg) -> None:

@@ -11,7 +11,7 @@ from splatseg.core.scans import MovingBox
 from splatseg.io.captures import read_capture
 from splatseg.io.moving import write_moving
 from splatseg.io.scene import load_scene
-from splatseg.street.blocks import load_drive
+from splatseg.street.files import load_drive
 from support.arrays import arrays_of
 
 FAST = ("--voxels", "2.0", "--geometry-iterations", "1", "--iterations", "3", "--rays", "64")

@@ -10,9 +10,9 @@ from splatseg.core import Camera, LabelledMesh, LabelledPoints, LayerInfo, Rende
 from splatseg.core.renderable import RenderableView
 from splatseg.errors import InputError, RangeError
 from splatseg.evaluate import PointSurfaceOptions, SurfaceField, truth_maps
-from splatseg.raycast import reference
 from splatseg.synthetic import SyntheticScene, cameras, cast, look_at, room
 from splatseg_bench.worlds import scene_mesh
+from support import brute_rays as reference
 
 LENSES = {
     "pinhole": {},

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from splatseg.core import Camera, Capture, Gaussians, PointCloud, View
+from splatseg.fit._options import RATES
 from splatseg.io.images import save_png
 from splatseg.render import render
 
@@ -161,3 +162,13 @@ def photograph(tmp_path: Path) -> CaptureMaker:
 def scene_photographed() -> Gaussians:
     """What `photograph` shows by default."""
     return tiny_scene()
+
+
+@pytest.fixture
+def with_rates(monkeypatch):
+    """Changes the learning rates and stages of fits for one test."""
+
+    def change(**values: float) -> None:
+        monkeypatch.setitem(RATES, "fast", replace(RATES["fast"], **values))
+
+    return change

@@ -97,11 +97,11 @@ def test_how_often_a_checkpoint_is_written_is_asked_for(
     folder: Path, tmp_path: Path, capsys, monkeypatch
 ) -> None:
     """A billionth of a second passes in 20 steps, a billion seconds do not."""
-    from splatseg.fit import _resume
+    from splatseg.fit import _checkpoint
 
     written: list[int] = []
     monkeypatch.setattr(
-        _resume.CheckpointClock, "write", lambda self, *_, **__: written.append(1) or 0.0
+        _checkpoint.CheckpointClock, "write", lambda self, *_, **__: written.append(1) or 0.0
     )
     scene = str(tmp_path / "scene")
     for seconds, expected in (("1e-9", True), ("1e9", False)):

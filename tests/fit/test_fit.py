@@ -1,4 +1,4 @@
-"""The whole fit on a tiny scene: it finds it again, repeats itself, and can be stopped."""
+"""Whole fits, and their schedule."""
 
 import os
 import signal
@@ -11,9 +11,11 @@ import torch
 from splatseg import _native
 from splatseg.core import Capture, Gaussians, PointCloud, View
 from splatseg.core.sh import SH_C0
-from splatseg.errors import InputError, MissingFileError
+from splatseg.errors import InputError, MissingFileError, RangeError
 from splatseg.evaluate import evaluate_photographs
 from splatseg.fit import FitOptions, FitProgress, FitResult, fit
+from splatseg.fit._options import COLOUR_RATE
+from splatseg.fit._parameters import count_at, degree_at, rates_at, reduction_at
 from splatseg.lift import GaussianField
 from splatseg.render import render
 
@@ -61,8 +63,9 @@ def test_photographs_with_a_lens_are_matched_in_their_own_pixels(make_capture) -
     assert _held_out(fit(capture, options=OPTIONS), capture) > 26
 
 
-def test_the_reference_backend_takes_the_same_steps(capture: Capture) -> None:
-    options = replace(OPTIONS, steps=3, quarter_until=0.0, half_until=0.0)
+def test_the_reference_backend_takes_the_same_steps(capture: Capture, with_rates) -> None:
+    with_rates(quarter_until=0.0, half_until=0.0)
+    options = replace(OPTIONS, steps=3)
     fast, slow = (fit(capture, options=options, backend=name) for name in ("cpu", "reference"))
     for name in ("means", "scales", "opacities", "sh"):
         torch.testing.assert_close(
@@ -184,26 +187,30 @@ def test_penalties_make_gaussians_faint_and_small(capture: Capture) -> None:
     assert float(small.scales.mean()) < 0.9 * float(free.scales.mean())
 
 
-def test_harmonics_wait_for_their_turn(capture: Capture) -> None:
-    options = replace(OPTIONS, steps=30, sh_degree=2, sh_degree_interval=0.5)
+def test_harmonics_wait_for_their_turn(capture: Capture, with_rates) -> None:
+    with_rates(sh_degree_interval=0.5)
+    options = replace(OPTIONS, steps=30, sh_degree=2)
     sh = fit(capture, options=options).gaussians.sh
     assert bool(sh[:, 1:4].any())
     assert not bool(sh[:, 4:].any())
 
 
-def test_coarse_photographs_teach_the_same_scene(make_capture) -> None:
+def test_coarse_photographs_teach_the_same_scene(make_capture, with_rates) -> None:
     """Fitted at a quarter of the size all along, the full-size views look right too."""
     capture = make_capture(width=260, height=256, fx=260.0, fy=260.0)
     options = replace(OPTIONS, steps=120, noise=0.0)
-    coarse = fit(capture, options=replace(options, quarter_until=1.0))
+    with_rates(quarter_until=1.0)
+    coarse = fit(capture, options=options)
     assert _held_out(coarse, capture) > 21
-    fine = fit(capture, options=replace(options, steps=1, quarter_until=0.0, half_until=0.0))
-    quick = fit(capture, options=replace(options, steps=1, quarter_until=1.0))
+    quick = fit(capture, options=replace(options, steps=1))
+    with_rates(quarter_until=0.0, half_until=0.0)
+    fine = fit(capture, options=replace(options, steps=1))
     assert not _same(fine.gaussians, quick.gaussians)
 
 
-def test_noise_is_part_of_the_fit(capture: Capture) -> None:
-    options = replace(OPTIONS, steps=10, start_opacity=0.02)
+def test_noise_is_part_of_the_fit(capture: Capture, monkeypatch) -> None:
+    monkeypatch.setattr("splatseg.fit._start.START_OPACITY", 0.02)
+    options = replace(OPTIONS, steps=10)
     quiet = fit(capture, options=replace(options, noise=0.0)).gaussians
     assert not torch.equal(quiet.means, fit(capture, options=options).gaussians.means)
 
@@ -215,12 +222,12 @@ def test_the_first_step_is_the_rate(capture: Capture) -> None:
     grey = PointCloud(
         points=capture.points.points, colours=torch.full((60, 3), 128, dtype=torch.uint8)
     )
-    options = replace(OPTIONS, steps=1, colour_rate=0.25)
+    options = replace(OPTIONS, steps=1)
     found = fit(replace(capture, points=grey), options=options).gaussians
     moved = (found.sh[:, 0] - colours).abs()
     assert float(moved.max()) > 0
     still = moved < 1e-6
-    torch.testing.assert_close(moved[~still], torch.full_like(moved[~still], 0.25))
+    torch.testing.assert_close(moved[~still], torch.full_like(moved[~still], COLOUR_RATE))
 
 
 def test_both_parts_of_the_loss_are_used(capture: Capture) -> None:
@@ -294,7 +301,7 @@ def test_photographs_with_alpha_are_blended_over_the_background(
     assert float(covered) < 0.9 * float(render(over_white.gaussians, camera).alpha.mean())
 
 
-def test_millimetres_are_as_good_as_kilometres(capture: Capture) -> None:
+def test_millimetres_are_as_good_as_kilometres(capture: Capture, monkeypatch) -> None:
     """The same scene in other units takes the same steps: walk and penalties scale with it."""
 
     def scaled(by: float) -> Capture:
@@ -307,7 +314,8 @@ def test_millimetres_are_as_good_as_kilometres(capture: Capture) -> None:
         points = replace(capture.points, points=capture.points.points * by)
         return replace(capture, views=tuple(views), points=points)
 
-    options = replace(OPTIONS, steps=60, scale_penalty=1.0, noise=1e5, start_opacity=0.03)
+    monkeypatch.setattr("splatseg.fit._start.START_OPACITY", 0.03)
+    options = replace(OPTIONS, steps=60, scale_penalty=1.0, noise=1e5)
     one = fit(capture, options=options).gaussians
     for by in (1024.0, 1 / 8):
         other = fit(scaled(by), options=options).gaussians
@@ -315,3 +323,124 @@ def test_millimetres_are_as_good_as_kilometres(capture: Capture) -> None:
         moved = (other.means / by - one.means).norm(dim=1)
         assert float(moved.median()) < 1e-3
         assert float((other.scales / by / one.scales).log().abs().median()) < 1e-2
+
+
+# What changes with progress, at the ends and half-way.
+
+
+SCHEDULE = FitOptions(sh_degree=2, max_gaussians=1000)
+
+
+@pytest.mark.parametrize(
+    ("rates", "means", "scales", "final"),
+    [("fast", (8e-4, 8e-6), 1e-2, 0.2), ("published", (1.6e-4, 1.6e-6), 5e-3, 1.0)],
+)
+def test_rates_fall_exponentially(rates, means, scales, final) -> None:
+    options = FitOptions(rates=rates)
+    begin, halfway, end = (rates_at(p, options=options, extent=3.0) for p in (0.0, 0.5, 1.0))
+    assert (begin.means, end.means) == pytest.approx((3 * means[0], 3 * means[1]))
+    assert halfway.means == pytest.approx(3 * (means[0] * means[1]) ** 0.5)
+    assert (begin.log_scales, halfway.log_scales, end.log_scales) == pytest.approx(
+        (scales, scales * final**0.5, scales * final)
+    )
+    assert (begin.colour, begin.sh_rest) == pytest.approx((2.5e-3, 1.25e-4))
+    assert (end.colour, end.logits, end.rotations) == pytest.approx(
+        (2.5e-3 * final, 5e-2 * final, 1e-3 * final)
+    )
+
+
+def test_photographs_grow_to_full_size() -> None:
+    def at(progress: float, width: int = 800, height: int = 600) -> int:
+        return reduction_at(progress, options=SCHEDULE, width=width, height=height)
+
+    assert [at(p) for p in (0.0, 0.0199, 0.02, 0.0699, 0.07, 1.0)] == [4, 4, 2, 2, 1, 1]
+    assert at(0.0, 256, 2000) == 4
+    assert at(0.0, 255, 2000) == 2
+    assert at(0.0, 2000, 127) == 1
+
+
+def test_degrees_come_one_by_one() -> None:
+    degrees = [degree_at(p, options=SCHEDULE) for p in (0.0, 0.09, 0.11, 0.19, 0.21, 1.0)]
+    assert degrees == [0, 0, 1, 1, 2, 2]
+
+
+def test_count_grows_to_the_most_and_stays() -> None:
+    def at(progress: float, start: int = 200) -> int:
+        return count_at(progress, options=SCHEDULE, start=start)
+
+    assert (at(0.0), at(0.25), at(0.5), at(1.0)) == (200, 600, 1000, 1000)
+    assert at(0.5, start=1000) == 1000
+
+
+def test_length_is_minutes_or_steps() -> None:
+    assert FitOptions().minutes == 10
+    assert FitOptions().with_length(steps=7).minutes is None
+    assert FitOptions().with_length() == FitOptions()
+    with pytest.raises(InputError, match="minutes, steps: expected one of the two"):
+        FitOptions(steps=3)
+    with pytest.raises(InputError, match="minutes, steps"):
+        FitOptions(minutes=None)
+    with pytest.raises(InputError, match="minutes, steps"):
+        FitOptions().with_length(minutes=1.0, steps=3)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("minutes", 0.0),
+        ("minutes", float("nan")),
+        ("max_gaussians", 0),
+        ("longest", 8),
+        ("sh_degree", 4),
+        ("noise", -1.0),
+        ("dssim_weight", 1.1),
+        ("densify_every", 0),
+    ],
+)
+def test_values_out_of_range_are_named(field: str, value: float) -> None:
+    with pytest.raises(RangeError, match=field):
+        FitOptions(**{field: value})
+
+
+@pytest.mark.parametrize(
+    ("field", "instead"), [("position_rate", "`rates` chooses"), ("grow_until", "half-way")]
+)
+def test_options_that_went_say_what_to_use_instead(field: str, instead: str) -> None:
+    with pytest.raises(InputError, match=f"{field}: this option was removed; .*{instead}"):
+        FitOptions(**{field: 0.1})
+
+
+def test_presets_differ_in_length_and_size() -> None:
+    quick, default, full = (FitOptions.preset(n) for n in ("quick", "default", "full"))
+    assert quick.minutes < default.minutes
+    assert (full.minutes, full.steps, full.sh_degree) == (None, 30_000, 3)
+    assert quick.max_gaussians < default.max_gaussians < full.max_gaussians
+    assert default == FitOptions()
+    assert (default.antialiased, default.low_pass_drawn) == (True, 0.1)
+    assert (full.antialiased, full.low_pass_drawn, full.rates) == (False, 0.3, "published")
+    with pytest.raises(InputError, match="preset: expected one of quick, default, full"):
+        FitOptions.preset("slow")
+
+
+def test_classic_has_its_own_penalties_and_its_own_end() -> None:
+    options = FitOptions(noise=7.0, seed=3).with_strategy("classic")
+    changed = (options.noise, options.opacity_penalty, options.scale_penalty)
+    assert (*changed, options.densify_until) == (0, 0, 0, 0.5)
+    assert options.seed == 3
+    back = options.with_strategy("mcmc")
+    assert back == FitOptions(seed=3)
+    assert back.with_strategy("mcmc") is back
+    with pytest.raises(InputError, match="strategy: expected one of mcmc, classic, fixed"):
+        back.with_strategy("new")
+
+
+def test_the_number_of_gaussians_goes_with_the_root_of_the_length() -> None:
+    options = FitOptions()
+    assert (options.minutes, options.max_gaussians) == (10.0, 500_000)
+    assert options.with_length(minutes=2.5).max_gaussians == 250_000
+    assert options.with_length(minutes=40.0).max_gaussians == 1_000_000
+    assert options.with_length(steps=15_000).max_gaussians == 500_000
+    assert options.with_length(steps=600).max_gaussians == 100_000
+    assert options.with_length(steps=1).max_gaussians == 20_000
+    assert options.with_length() is options
+    assert FitOptions.preset("quick").max_gaussians == 274_000

@@ -87,7 +87,9 @@ def errors(truth: Gaussians, positions: torch.Tensor) -> np.ndarray:
 
 
 @pytest.mark.parametrize("strategy", ["mcmc", "classic"])
-def test_a_known_scene_is_recovered(strategy: Strategy, tmp_path, rng) -> None:
+def test_a_known_scene_is_recovered(
+    strategy: Strategy, tmp_path, rng, with_rates, monkeypatch
+) -> None:
     truth = scene(rng)
     capture = photographed(truth, tmp_path, rng)
     assert capture.points is not None
@@ -96,14 +98,14 @@ def test_a_known_scene_is_recovered(strategy: Strategy, tmp_path, rng) -> None:
     assert np.abs(start - own).max() < 1e-6, "who is nearest says who is who"
     # Opaque enough from the start that nothing wanders off. All else is as it comes: growth,
     # relocation, noise, penalties; cloning, splitting, pruning.
+    monkeypatch.setattr("splatseg.fit._start.START_OPACITY", 0.5)
+    with_rates(final=0.5)
     options = FitOptions(
         minutes=None,
         steps=4600,
         max_gaussians=COUNT + 20,
         sh_degree=0,
         background="black",
-        start_opacity=0.5,
-        final_rate=0.5,
     ).with_strategy(strategy)
 
     result = fit(capture, options=options, backend="cpu")

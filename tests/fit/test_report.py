@@ -2,7 +2,7 @@
 
 import json
 import re
-from dataclasses import replace
+from dataclasses import asdict, replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -163,8 +163,8 @@ def test_too_short_for_a_curve_and_poses_that_were_found(fitted) -> None:
         track_length=2.5,
         lenses=(),
         seconds={"copies": 1.5, "features": 20.25, "mapping": 8.0},
-    ).as_json()
-    content = {"format": "splatseg-poses", "version": 1, "made_of": "x", "report": report}
+    )
+    content = {"format": "splatseg-poses", "version": 1, "made_of": "x", "report": asdict(report)}
     (root / "capture" / "poses.json").write_text(json.dumps(content))
     noted = replace(capture, notes=("sizes were <odd> & fixed",))
     short = replace(result, history=(), notes=("exposure +0.1",))
@@ -179,5 +179,5 @@ def test_too_short_for_a_curve_and_poses_that_were_found(fitted) -> None:
         assert expected in words
     assert "<odd>" not in text
     assert json.loads((root / "reports" / "fit.json").read_text())["poses"] == json.loads(
-        json.dumps(report)
+        json.dumps(asdict(report))
     )

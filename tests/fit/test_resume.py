@@ -22,9 +22,12 @@ from splatseg.fit import (
     checkpoint_summary,
     fit,
 )
-from splatseg.fit._checkpoint import read_checkpoint, write_checkpoint
-from splatseg.fit._identity import check_identity
-from splatseg.fit._resume import CheckpointClock
+from splatseg.fit._checkpoint import (
+    CheckpointClock,
+    check_identity,
+    read_checkpoint,
+    write_checkpoint,
+)
 from splatseg.fit._run import FitRun
 from splatseg.io.arrays import discard_checkpoint_file
 
@@ -35,8 +38,13 @@ OPTIONS = FitOptions(
     sh_degree=1,
     densify_from=20,
     densify_every=10,
-    sh_degree_interval=0.4,
 )
+
+
+@pytest.fixture(autouse=True)
+def late_harmonics(with_rates) -> None:
+    """Of degree 1 before and after a stop."""
+    with_rates(sh_degree_interval=0.4)
 
 
 def _same(one: Gaussians, other: Gaussians) -> bool:
@@ -95,10 +103,10 @@ def test_stops_change_no_bit(capture: Capture, path: Path, options: FitOptions) 
 
 def test_everything_that_a_step_changes_is_in_the_state(capture: Capture, path: Path) -> None:
     """Nothing differs between a run and its copy, now and ten steps later."""
-    from splatseg.fit._photographs import Photographs
+    from splatseg.fit._photographs import TrainingPhotographs
     from splatseg.render import get_backend
 
-    photographs = Photographs(capture.train_views, longest=OPTIONS.longest)
+    photographs = TrainingPhotographs(capture.train_views, longest=OPTIONS.longest)
     backend = get_backend("cpu")
     run = FitRun(capture, OPTIONS, backend, photographs)
     for _ in range(25):
@@ -133,16 +141,16 @@ def test_checkpoints_are_written_at_their_times(capture: Capture, path: Path) ->
 
 
 def test_seconds_between_checkpoints_grow_with_what_they_cost(path: Path, monkeypatch) -> None:
-    from splatseg.fit import _resume
-    from splatseg.fit._state import FitState
+    from splatseg.fit import _checkpoint
+    from splatseg.fit._checkpoint import FitState
 
     now = [100.0]
-    monkeypatch.setattr(_resume.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(_checkpoint.time, "monotonic", lambda: now[0])
 
     def slow(*_: object) -> None:
         now[0] += 2.0
 
-    monkeypatch.setattr(_resume, "write_checkpoint", slow)
+    monkeypatch.setattr(_checkpoint, "write_checkpoint", slow)
     clock = CheckpointClock(Checkpoints(path=path, seconds=30), identity={})
     due_after = []
     for _ in range(2):
@@ -321,10 +329,10 @@ def test_a_file_that_is_no_whole_checkpoint_says_so(capture: Capture, path: Path
             continue
         path.write_bytes(good)
         kept = read_checkpoint(path)
-        assert found.state.content == kept.state.content
-        assert found.state.tensors.keys() == kept.state.tensors.keys()
-        for name, tensor in kept.state.tensors.items():
-            assert torch.equal(found.state.tensors[name], tensor)
+        assert found.content == kept.content
+        assert found.tensors.keys() == kept.tensors.keys()
+        for name, tensor in kept.tensors.items():
+            assert torch.equal(found.tensors[name], tensor)
     path.write_bytes(good)
     with path.open("wb") as file:
         np.savez(file, allow_pickle=False, means=np.zeros(3))
@@ -341,15 +349,15 @@ def test_states_that_do_not_fit_are_refused(capture: Capture, path: Path) -> Non
 
     def refused(*, tensors: dict[str, object] | None = None, **content: object) -> str:
         state = replace(
-            good.state,
+            good,
             tensors={
                 name: tensor
-                for name, tensor in (dict(good.state.tensors) | (tensors or {})).items()
+                for name, tensor in (dict(good.tensors) | (tensors or {})).items()
                 if tensor is not None
             },
-            content=dict(good.state.content) | content,
+            content=dict(good.content) | content,
         )
-        write_checkpoint(replace(good, state=state), path)
+        write_checkpoint(state, path)
         with pytest.raises(FileFormatError) as caught:
             fit(capture, options=OPTIONS, checkpoints=checkpoints)
         return str(caught.value)
@@ -360,7 +368,7 @@ def test_states_that_do_not_fit_are_refused(capture: Capture, path: Path) -> Non
     assert "expected as many moments" in refused(
         tensors={
             f"second/{k}": t[:5]
-            for k, t in good.state.group(
+            for k, t in good.group(
                 "second",
                 ["means", "log_scales", "rotations", "logits", "sh"],
                 device=torch.device("cpu"),
@@ -378,6 +386,19 @@ def test_states_that_do_not_fit_are_refused(capture: Capture, path: Path) -> Non
     assert "expected a number 'steps', got 'many'" in refused(steps="many")
     assert "the state of a fit" in refused(history=[{"step": 1}])
     assert "the state of a fit" in refused(stages=None)
+
+
+def test_a_published_fit_of_version_0_1_goes_on(capture: Capture, path: Path) -> None:
+    """It recorded its learning rates one by one."""
+    options = replace(OPTIONS, rates="published")
+    checkpoints = Checkpoints(path=path, resume=True)
+    fit(capture, options=options, checkpoints=checkpoints, progress=_stop_after(30))
+    gone = {"rates": "absent", "position_rate": 1.6e-4, "final_rate": 1.0, "quarter_until": 0.0}
+    defaults = {"rates": "absent", "position_rate": 8e-4, "final_rate": 0.2, "quarter_until": 0.02}
+    _recorded_otherwise(path, options=gone, defaults=defaults)
+    with pytest.raises(InputError, match='rates "published" instead of "fast"'):
+        fit(capture, options=OPTIONS, checkpoints=checkpoints)
+    assert fit(capture, options=options, checkpoints=checkpoints).steps == 60
 
 
 def test_a_checkpoint_that_cannot_be_written_is_told_of_and_the_fit_goes_on(

@@ -1,4 +1,4 @@
-"""Starts without points: where the cameras look, and where photographs agree."""
+"""Start points and the first Gaussians."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -6,12 +6,18 @@ from pathlib import Path
 import pytest
 import torch
 
-from splatseg.core import Camera, Capture
+from splatseg.core import Camera, Capture, PointCloud, View
 from splatseg.errors import InputError
 from splatseg.evaluate import evaluate_photographs
 from splatseg.fit import FitOptions, fit
-from splatseg.fit._photographs import Photographs
-from splatseg.fit._start import depth_range_of_cameras, random_points, with_start_points
+from splatseg.fit._photographs import TrainingPhotographs
+from splatseg.fit._start import (
+    depth_range_of_cameras,
+    initial_parameters,
+    random_points,
+    scene_extent,
+    with_start_points,
+)
 from splatseg.io.images import save_png
 from splatseg.lift import GaussianField
 
@@ -27,7 +33,7 @@ def _looking_along_z(x: float, y: float = 0.0, turn: float = 0.0) -> Camera:
     return Camera(width=40, height=30, fx=40.0, fy=40.0, cx=20.0, cy=15.0, cam_from_world=pose)
 
 
-def _drawn(photographs: Photographs, count: int, seed: int = 0) -> torch.Tensor:
+def _drawn(photographs: TrainingPhotographs, count: int, seed: int = 0) -> torch.Tensor:
     generator = torch.Generator().manual_seed(seed)
     return random_points(photographs, count=count, generator=generator).points
 
@@ -69,7 +75,7 @@ def test_cameras_that_look_elsewhere_have_no_ball() -> None:
 
 def test_points_lie_on_what_is_photographed(capture: Capture) -> None:
     """Most pixels show blobs within 1.3 of the centre; others show black, which is ambiguous."""
-    photographs = Photographs(capture.train_views, longest=1600)
+    photographs = TrainingPhotographs(capture.train_views, longest=1600)
     generator = torch.Generator().manual_seed(1)
     cloud = random_points(photographs, count=2000, generator=generator)
     assert len(cloud) == 2000
@@ -89,7 +95,7 @@ def test_points_lie_on_what_is_photographed(capture: Capture) -> None:
 def test_points_have_the_colour_of_their_pixel(capture: Capture) -> None:
     """Each point is seen by the view it was drawn from in a pixel of its colour."""
     views = capture.train_views[:1]
-    photographs = Photographs(views, longest=1600)
+    photographs = TrainingPhotographs(views, longest=1600)
     cloud = random_points(photographs, count=300, generator=torch.Generator().manual_seed(1))
     assert cloud.colours is not None
     pixels, depth = views[0].camera.project(cloud.points.double())
@@ -100,7 +106,7 @@ def test_points_have_the_colour_of_their_pixel(capture: Capture) -> None:
 
 
 def test_same_seed_same_points(capture: Capture) -> None:
-    photographs = Photographs(capture.train_views, longest=1600)
+    photographs = TrainingPhotographs(capture.train_views, longest=1600)
     assert torch.equal(_drawn(photographs, 100), _drawn(photographs, 100))
     assert not torch.equal(_drawn(photographs, 100), _drawn(photographs, 100, seed=1))
 
@@ -111,13 +117,13 @@ def test_masked_pixels_start_nothing(capture: Capture, tmp_path: Path) -> None:
     mask[:, 28] = 255
     save_png(mask, tmp_path / "mask.png")
     views = tuple(replace(view, mask=tmp_path / "mask.png") for view in capture.train_views)
-    photographs = Photographs(views, longest=1600)
+    photographs = TrainingPhotographs(views, longest=1600)
     points = _drawn(photographs, 110).reshape(len(views), -1, 3)
     for view, own in zip(views, points, strict=True):
         pixels, _ = view.camera.project(own.double())
         assert bool((pixels[:, 0].floor() == 28).all())
     save_png(torch.zeros(48, 56, dtype=torch.uint8), tmp_path / "mask.png")
-    assert len(_drawn(Photographs(views, longest=1600), 110)) == 0
+    assert len(_drawn(TrainingPhotographs(views, longest=1600), 110)) == 0
 
 
 def test_a_fit_starts_without_points(capture: Capture) -> None:
@@ -137,7 +143,7 @@ def test_a_fit_starts_without_points(capture: Capture) -> None:
 
 
 def test_the_capture_keeps_its_points(capture: Capture) -> None:
-    photographs = Photographs(capture.train_views, longest=1600)
+    photographs = TrainingPhotographs(capture.train_views, longest=1600)
     generator = torch.Generator().manual_seed(0)
 
     def points(start: str, **options: object) -> int:
@@ -153,7 +159,7 @@ def test_the_capture_keeps_its_points(capture: Capture) -> None:
 
 def test_few_points_are_joined_by_places_where_photographs_agree(capture: Capture) -> None:
     """The capture's points come first, as they were; those beside them lie between their depths."""
-    photographs = Photographs(capture.train_views, longest=1600)
+    photographs = TrainingPhotographs(capture.train_views, longest=1600)
 
     def filled(**options: object) -> Capture:
         generator = torch.Generator().manual_seed(0)
@@ -195,10 +201,80 @@ def test_few_points_are_joined_by_places_where_photographs_agree(capture: Captur
 
 def test_places_that_views_disagree_about_are_left_out(capture: Capture) -> None:
     """Photographs that have nothing in common agree nowhere."""
-    photographs = Photographs(capture.train_views, longest=1600)
+    photographs = TrainingPhotographs(capture.train_views, longest=1600)
     generator = torch.Generator().manual_seed(0)
     none = random_points(photographs, count=500, generator=generator, max_difference=0.0)
     assert len(none) == 0
     generator = torch.Generator().manual_seed(0)
     some = random_points(photographs, count=500, generator=generator, max_difference=0.02)
     assert 0 < len(some) < 500
+
+
+# From start points to Gaussians, by hand.
+
+
+def _view(x: float, y: float, z: float) -> View:
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, 3] = -torch.tensor([x, y, z], dtype=torch.float64)
+    camera = Camera(width=8, height=8, fx=8.0, fy=8.0, cx=4.0, cy=4.0, cam_from_world=pose)
+    return View(name=f"{x}_{y}_{z}", camera=camera, image=Path("x.png"))
+
+
+def _capture(points: torch.Tensor, colours: torch.Tensor | None = None) -> Capture:
+    return Capture(
+        path=Path("capture"),
+        format="test",
+        views=(_view(0, 0, -100), _view(0, 0, -50)),
+        points=PointCloud(points=points, colours=colours),
+    )
+
+
+def _start(capture: Capture, **options: object):
+    return initial_parameters(
+        capture, options=FitOptions(**options), generator=torch.Generator().manual_seed(0)
+    )
+
+
+def test_scales_are_the_mean_of_three_distances() -> None:
+    points = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3], [10, 10, 10]])
+    gaussians = _start(_capture(points)).gaussians()
+    assert gaussians.scales[0].tolist() == pytest.approx([2.0] * 3)  # (1 + 2 + 3) / 3
+    assert torch.equal(gaussians.means, points)
+    assert gaussians.opacities.tolist() == pytest.approx([0.1] * 5)
+    assert gaussians.rotations.tolist() == [[1, 0, 0, 0]] * 5
+
+
+def test_far_and_doubled_points_get_scales_that_can_be_drawn() -> None:
+    """At most a tenth of the distance to the nearest camera, at least a hundred-thousandth."""
+    points = torch.tensor([[0.0, 0, 0]] * 4 + [[0, 0, 5000.0]])
+    scales = _start(_capture(points)).gaussians().scales
+    assert scales[4].tolist() == pytest.approx([505.0] * 3)
+    assert scales[0].tolist() == pytest.approx([50e-5] * 3)
+    lone = _start(_capture(torch.zeros(1, 3))).gaussians().scales
+    assert lone[0].tolist() == pytest.approx([5.0] * 3)
+
+
+def test_colours_are_the_points() -> None:
+    points = torch.rand(3, 3)
+    colours = torch.tensor([[0, 128, 255], [10, 20, 30], [255, 255, 255]], dtype=torch.uint8)
+    coloured = _start(_capture(points, colours), sh_degree=3).gaussians()
+    assert coloured.sh.shape == (3, 16, 3)
+    torch.testing.assert_close(coloured.colours, colours / 255.0)
+    assert not bool(coloured.sh[:, 1:].any())
+    grey = _start(_capture(points)).gaussians()
+    torch.testing.assert_close(grey.colours, torch.full((3, 3), 0.5))
+
+
+def test_too_many_points_are_drawn_from() -> None:
+    points = torch.arange(300.0).reshape(100, 3)
+    chosen = _start(_capture(points), max_gaussians=30).means
+    assert len(chosen) == 30
+    assert len(torch.unique(chosen[:, 0])) == 30
+    assert bool((torch.cdist(chosen, points).amin(dim=1) == 0).all())
+
+
+def test_extent_is_the_reach_of_the_cameras() -> None:
+    points = torch.tensor([[0.0, 0, 1000], [0, 0, 1000], [0, 0, 2000]])
+    views = (_view(0, 0, 0), _view(4, 0, 0))
+    assert scene_extent(views, points) == pytest.approx(2.2)
+    assert scene_extent(views[:1], points) == pytest.approx(1.0)

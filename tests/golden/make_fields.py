@@ -15,7 +15,7 @@ from torch import Tensor
 from splatseg.core import Camera, LayerEdit, LayerInfo
 from splatseg.street.field import MeshField
 from splatseg.street.files import VERSION, load_mesh_field, save_mesh_field
-from splatseg.street.mesh import PrimitiveMesh
+from splatseg.street.primitives import PrimitiveMesh
 from splatseg.street.radiance import RadianceModel, RadianceOptions
 
 ROOT = Path(__file__).parent / f"field-v{VERSION}"
@@ -28,14 +28,11 @@ OPTIONS = RadianceOptions(  # all of them, so that other defaults change nothing
     feature_frequencies=1,
     position_frequencies=1,
     view_frequencies=1,
-    position_scale=4.0,
-    view_encoding="normal_view",
     width=6,
     depth=2,
     skip=2,
     semantic_width=5,
     colour_widths=(4,),
-    background="network",
     background_widths=(4,),
     order="distance",
     max_hits=5,
@@ -46,11 +43,7 @@ OPTIONS = RadianceOptions(  # all of them, so that other defaults change nothing
     iterations=100,
     rate=2e-3,
     feature_rate=2e-2,
-    final_rate=0.1,
     semantic_weight=0.1,
-    longest=1600,
-    view_pixels=48,
-    cache_memory=1 << 30,
 )
 POINTS = torch.tensor(
     [
@@ -90,7 +83,7 @@ def golden_field() -> MeshField:
     }
     # A third is nothing that float16 holds: matrices stay float32, features are float16.
     state = {name: tensor if name == "features" else tensor / 3 for name, tensor in state.items()}
-    state |= {name: model.state[name] for name in ("centre", "scale")}
+    state |= {"centre": model.state["centre"], "scale": torch.tensor(2.0)}
     # Half transparent, with classes that depend on the place.
     state["opacity.weight"] /= 128
     state["opacity.bias"] = torch.tensor([-0.25])

@@ -10,9 +10,9 @@ import torch
 
 from splatseg.core import Camera, Capture, PointCloud, Similarity
 from splatseg.io.captures import read_capture
-from splatseg.pose.doctor import DoctorOptions, Matches, diagnose, match_views
+from splatseg.pose.doctor import DoctorOptions, ViewMatches, diagnose, match_views
 
-OPTIONS = DoctorOptions(max_views=15, longest=512)
+OPTIONS = DoctorOptions(max_views=15)
 FLIP = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))
 Y_UP = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
 OLD_NERFSTUDIO = [[0, 1, 0], [1, 0, 0], [0, 0, -1]]
@@ -90,11 +90,11 @@ class Matched:
     """A healthy capture, and what its photographs have in common, which no fault changes."""
 
     capture: Capture
-    matches: Matches
+    matches: ViewMatches
 
 
 def matched(capture: Capture) -> Matched:
-    matches = match_views(capture.views, max_views=OPTIONS.max_views, longest=OPTIONS.longest)
+    matches = match_views(capture.views, max_views=OPTIONS.max_views, longest=800)
     return Matched(capture, matches)
 
 

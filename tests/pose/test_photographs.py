@@ -9,11 +9,11 @@ import pytest
 from PIL import Image
 
 from splatseg.errors import InputError, MissingFileError, MissingPackageError
-from splatseg.pose import PoseOptions, _process, holds_photographs, recover_poses
-from splatseg.pose._exif import lens_facts
+from splatseg.pose import PoseOptions, _recover, holds_photographs, recover_poses
 from splatseg.pose._photographs import (
     WorkingLens,
     find_photographs,
+    lens_facts,
     read_headers,
     write_working_copies,
 )
@@ -187,13 +187,13 @@ def test_no_such_folder(tmp_path: Path) -> None:
 def test_without_pycolmap_the_message_says_how_to_get_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(_process.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(_recover.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(MissingPackageError, match=r"pip install 'splatseg\[sfm\]'"):
         recover_poses(tmp_path)
 
 
 def test_options_are_checked() -> None:
-    for name, value in (("longest", 10), ("frames", 2), ("threads", 0), ("overlap", 0)):
+    for name, value in (("longest", 10), ("frames", 2), ("threads", 0)):
         with pytest.raises(InputError, match=f"{name}: expected at least"):
             PoseOptions(**{name: value})
     with pytest.raises(InputError, match="mapper"):

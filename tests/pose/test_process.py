@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 
 from splatseg.errors import BackendError
-from splatseg.pose import PoseOptions, PoseProgress, _process, recover_poses
+from splatseg.pose import PoseOptions, PoseProgress, _recover, recover_poses
 
-OPTIONS = PoseOptions(longest=320, max_features=1500, threads=1)
+OPTIONS = PoseOptions(longest=320, threads=1)
 
 
 @pytest.fixture
@@ -25,7 +25,7 @@ def processes(monkeypatch: pytest.MonkeyPatch) -> list[subprocess.Popen[str]]:
             super().__init__(*words, **named)
             started.append(self)
 
-    monkeypatch.setattr(_process.subprocess, "Popen", Noted)
+    monkeypatch.setattr(_recover.subprocess, "Popen", Noted)
     return started
 
 
@@ -62,7 +62,7 @@ def test_after_ctrl_c_nothing_runs_and_a_second_run_goes_on(
     features = json.loads((kept / "work" / "job.json").read_text())["database"]
     assert Path(features).stat().st_size > 100_000
     # Other options are other work: nothing of the old is used.
-    other = PoseOptions(longest=300, max_features=1500, threads=1)
+    other = PoseOptions(longest=300, threads=1)
     result = recover_poses(folder, folder=kept, options=other)
     assert len(result.report.registered) == 4
     assert sorted(entry.name for entry in kept.iterdir()) == ["poses.json", "sparse"]
@@ -96,22 +96,22 @@ def test_a_failure_is_told_with_its_last_words(tmp_path: Path) -> None:
     with pytest.raises(
         BackendError, match=r"ended with status 1: .*KeyError: 'database'.*log\.txt"
     ):
-        _process.run_worker(job, tmp_path, progress=lambda stage, done, total: None)
+        _recover.run_worker(job, tmp_path, progress=lambda stage, done, total: None)
 
 
 def test_what_a_library_prints_is_passed_over() -> None:
     told: list[tuple[str, int, int]] = []
     for line in ("hello", "3", '{"stage": "x"}', '{"stage": "x", "done": 1, "total": 2}'):
-        _process._pass_on(line, lambda *said: told.append(said))
+        _recover._pass_on(line, lambda *said: told.append(said))
     assert told == [("x", 1, 2)]
 
 
 def test_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", "3")
-    assert _process.usable_threads(5) == 5
-    assert _process.usable_threads(None) == 3
+    assert _recover.usable_threads(5) == 5
+    assert _recover.usable_threads(None) == 3
     monkeypatch.setenv("OMP_NUM_THREADS", "none")
-    assert _process.usable_threads(None) >= 1
+    assert _recover.usable_threads(None) >= 1
 
 
 def test_the_process_needs_neither_torch_nor_pillow() -> None:

@@ -6,8 +6,10 @@ import sys
 import pytest
 import torch
 
+import splatseg.raycast as raycast
 from splatseg.errors import InputError, MissingPackageError, RangeError, ShapeError
-from splatseg.raycast import RayCaster, _caster, reference
+from splatseg.raycast import RayCaster
+from support import brute_rays as reference
 
 TINY = 1e-5
 
@@ -106,7 +108,7 @@ def test_rays_in_blocks_are_the_same(monkeypatch) -> None:
     origins = directions.flip(0) * 0.2
     caster = RayCaster(vertices, faces)
     whole = caster.cast(origins, directions)
-    monkeypatch.setattr(_caster, "_RAYS", 7)
+    monkeypatch.setattr(raycast, "_RAYS", 7)
     blocks = caster.cast(origins, directions)
     assert torch.equal(blocks.faces, whole.faces)
     assert torch.equal(blocks.distances, whole.distances)

@@ -14,8 +14,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from render_scenes import Bench
 
 from splatseg.errors import BackendError
-from splatseg.render.cpu import isa, set_isa, set_threads, threads
-from splatseg.render.cpu._threads import ISAS
+from splatseg.render.cpu import ISAS, isa, set_isa, set_threads, threads
 
 
 def _instruction_sets() -> list[str]:

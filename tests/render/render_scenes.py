@@ -11,8 +11,8 @@ from splatseg import render as splat
 from splatseg.core import Camera, Gaussians
 from splatseg.core.rigid import rotation_from_quaternion
 from splatseg.render import RenderOptions
-from splatseg.render._constants import ALPHA_MIN, MEDIAN_TRANSMITTANCE, TRANSMITTANCE_MIN
-from splatseg.render.reference._project import project
+from splatseg.render._values import ALPHA_MIN, MEDIAN_TRANSMITTANCE, TRANSMITTANCE_MIN
+from splatseg.render.blending import project
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,16 +54,13 @@ class Bench:
             gaussians, camera, pixels, k, options=self.options(), backend=self.name
         )
 
-    def weights(self, gaussians: Gaussians, camera: Camera, pixels=None, k=None, *, layout="csr"):
+    def weights(self, gaussians: Gaussians, camera: Camera, pixels=None, k=None):
         return splat.weights(
-            gaussians,
-            camera,
-            pixels,
-            k,
-            layout=layout,
-            options=self.options(),
-            backend=self.name,
+            gaussians, camera, pixels, k, options=self.options(), backend=self.name
         )
+
+    def image_weights(self, gaussians: Gaussians, camera: Camera):
+        return splat.image_weights(gaussians, camera, options=self.options(), backend=self.name)
 
 
 def random_camera(rng: np.random.Generator, *, width: int = 50, height: int = 40) -> Camera:

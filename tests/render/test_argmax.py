@@ -10,8 +10,8 @@ from splatseg import render as splat
 from splatseg.core import Camera, Gaussians
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.render import SparseSignal, StrongestChannels
+from splatseg.render import reference as reference_backend
 from splatseg.render.cpu import set_threads, threads
-from splatseg.render.reference import _backend as reference_backend
 
 WIDTH, HEIGHT, COUNT = 37, 26, 90
 LENSES = {"pinhole": {}, "barrel": {"model": "opencv", "distortion": (-0.15, 0.02)}}

@@ -12,7 +12,7 @@ import torch
 from render_scenes import assert_close, axis_camera, float32, gaussians_of
 
 from splatseg.core import Camera
-from splatseg.render._constants import ALPHA_MIN, TRANSMITTANCE_MIN
+from splatseg.render._values import ALPHA_MIN, TRANSMITTANCE_MIN
 
 TINY = 1e-6
 LOW_PASS = 0.3

@@ -17,11 +17,11 @@ from render_scenes import (
     random_gaussians,
 )
 
+import splatseg.render.cuda as cuda_module
 from splatseg import render as splat
 from splatseg.errors import BackendError, MissingPackageError
 from splatseg.render import RenderOptions
 from splatseg.render.cuda import CudaBackend
-from splatseg.render.cuda import _backend as cuda_module
 from splatseg.render.reference import ReferenceBackend
 
 OPTIONS = RenderOptions(alpha_max=0.999)
@@ -119,9 +119,11 @@ def test_another_opacity_cap_is_refused(cuda, scene, camera, alpha_max):
     image = torch.zeros(camera.height, camera.width, 1)
     for ask in (
         lambda: cuda.render(scene, camera, None, options=options),
-        lambda: cuda.back_project(scene, camera, image, options=options),
-        lambda: cuda.contributors(scene, camera, torch.tensor([[0, 0]]), 1, options=options),
-        lambda: cuda.weights(scene, camera, None, None, layout="csr", options=options),
+        lambda: cuda.prepare(scene, camera, options=options).back_project(image),
+        lambda: cuda.prepare(scene, camera, options=options).contributors(
+            torch.tensor([[0, 0]]), 1
+        ),
+        lambda: cuda.prepare(scene, camera, options=options).rows(None, None),
     ):
         with pytest.raises(BackendError, match=r"0\.999.*RenderOptions\(alpha_max=0\.999\)"):
             ask()
@@ -153,7 +155,7 @@ def test_the_adjoint_is_the_transpose(cuda, rng, scene, camera, channels):
     signal = float32(rng.normal(size=(COUNT, channels)))
     image = float32(rng.normal(size=(camera.height, camera.width, channels)))
     drawn = cuda.render(scene, camera, signal, options=OPTIONS)
-    back = cuda.back_project(scene, camera, image, options=OPTIONS)
+    back = cuda.prepare(scene, camera, options=OPTIONS).back_project(image)
     product = drawn.image.double() * image.double()
     right = (signal.double() * back.sums.double()).sum()
     assert abs(product.sum() - right) < 1e-5 * product.abs().sum()
@@ -169,7 +171,7 @@ def test_rows_are_those_of_w(cuda, rng, scene, camera):
         ],
         dim=1,
     )
-    every = cuda.weights(scene, camera, None, None, layout="csr", options=OPTIONS)
+    every = cuda.prepare(scene, camera, options=OPTIONS).rows(None, None)
     rows = torch.repeat_interleave(torch.arange(every.shape[0]), every.indptr.diff())
     found = torch.zeros_like(dense)
     found[rows, every.ids.long()] = every.weights.float()
@@ -177,15 +179,15 @@ def test_rows_are_those_of_w(cuda, rng, scene, camera):
 
     # In the order asked for, the same pixel twice, and one where nothing is.
     pixels = torch.tensor([[20, 20], [3, 4], [20, 20], [36, 28]])
-    some = cuda.weights(scene, camera, pixels, None, layout="csr", options=OPTIONS)
+    some = cuda.prepare(scene, camera, options=OPTIONS).rows(pixels, None)
     wanted = dense[pixels[:, 1] * camera.width + pixels[:, 0]]
     signal = float32(rng.normal(size=(COUNT, 4)))
     torch.testing.assert_close(some.product(signal), wanted @ signal, atol=5e-3, rtol=0)
 
-    ranked = cuda.contributors(scene, camera, pixels, 3, options=OPTIONS)
+    ranked = cuda.prepare(scene, camera, options=OPTIONS).contributors(pixels, 3)
     strongest = wanted.sort(dim=1, descending=True).values[:, :3]
     torch.testing.assert_close(ranked.weights, strongest, atol=1e-5, rtol=1e-4)
-    blocks = cuda.weights(scene, camera, None, None, layout="blocks", options=OPTIONS)
+    blocks = cuda.prepare(scene, camera, options=OPTIONS).blocks()
     torch.testing.assert_close(blocks.product(signal), every.product(signal), atol=1e-5, rtol=0)
 
 
@@ -225,6 +227,9 @@ def test_nothing_visible(cuda, scene, camera, count):
     drawn.image.sum().backward()
     assert not signal.grad.any()
     image = torch.ones(camera.height, camera.width, 2)
-    assert cuda.back_project(hidden, camera, image, options=OPTIONS).sums.shape == (count, 2)
-    kept = cuda.weights(hidden, camera, None, None, layout="csr", options=OPTIONS)
+    assert cuda.prepare(hidden, camera, options=OPTIONS).back_project(image).sums.shape == (
+        count,
+        2,
+    )
+    kept = cuda.prepare(hidden, camera, options=OPTIONS).rows(None, None)
     assert len(kept.ids) == 0

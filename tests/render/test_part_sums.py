@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from splatseg.errors import ShapeError
-from splatseg.render import ImageWeights, weights
+from splatseg.render import ImageWeights, image_weights, weights
 from splatseg.render.cpu import set_threads
 
 from .render_scenes import Bench, random_camera, random_gaussians
@@ -32,9 +32,7 @@ def dense(scene, part: torch.Tensor, backend: Bench) -> np.ndarray:
 
 def sums(scene, part: torch.Tensor, backend: Bench) -> np.ndarray:
     gaussians, camera = scene
-    image = weights(
-        gaussians, camera, layout="blocks", options=backend.options(), backend=backend.name
-    )
+    image = image_weights(gaussians, camera, options=backend.options(), backend=backend.name)
     assert isinstance(image, ImageWeights)
     found = image.part_sums(part)
     table = np.zeros((len(found.indptr) - 1, len(gaussians)))

@@ -11,9 +11,7 @@ from scipy.interpolate import BSpline
 from splatseg.core import Camera, View
 from splatseg.core.rigid import quaternion_from_rotation
 from splatseg.errors import InputError, RangeError
-from splatseg.render._path_poses import Poses
-from splatseg.render._path_spline import poses_along_spline
-from splatseg.render.paths import camera_path, is_forward_facing
+from splatseg.render.paths import Poses, camera_path, is_forward_facing, poses_along_spline
 
 UP = (0.0, 0.0, 1.0)
 
@@ -138,7 +136,7 @@ def test_a_film_looks_about_less_than_people_do(rng) -> None:
 
 def test_the_spline_is_the_uniform_cubic_b_spline(rng) -> None:
     """Against SciPy, through equally dense parameters instead of constant speed."""
-    from splatseg.render import _path_spline
+    from splatseg.render import paths as _path_spline
 
     places = torch.from_numpy(rng.normal(size=(9, 3)))
     flat = Poses(centres=places, quaternions=torch.eye(4).double()[:1].expand(9, 4))

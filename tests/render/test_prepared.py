@@ -8,6 +8,7 @@ import pytest
 import torch
 from render_scenes import Bench, float32, random_camera, random_gaussians
 
+import splatseg.render.reference as reference_backend
 from splatseg import render as splat
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.render import SparseImage, _backend
@@ -15,7 +16,6 @@ from splatseg.render.cpu import set_threads
 from splatseg.render.cuda import CudaBackend
 from splatseg.render.prepared import PreparedView
 from splatseg.render.reference import ReferenceBackend
-from splatseg.render.reference import _backend as reference_backend
 
 WIDTH, HEIGHT, COUNT = 37, 26, 90
 LENSES = {"pinhole": {}, "barrel": {"model": "opencv", "distortion": (-0.15, 0.02)}}

@@ -91,11 +91,11 @@ def test_median_contributor_has_the_median_depth(backend, camera, scene):
     torch.testing.assert_close(drawn.median_depth.flatten(), depth.float(), rtol=1e-6, atol=0)
 
 
-@pytest.mark.parametrize("layout", ["csr", "blocks"])
+@pytest.mark.parametrize("kind", ["weights", "image_weights"])
 @pytest.mark.parametrize("channels", [1, 5, 64])
-def test_kept_weights_render_and_back_project(backend, rng, camera, scene, layout, channels):
+def test_kept_weights_render_and_back_project(backend, rng, camera, scene, kind, channels):
     """Half precision rounds each weight by at most 2^-11 of it."""
-    kept = backend.weights(scene, camera, layout=layout)
+    kept = getattr(backend, kind)(scene, camera)
     assert kept.shape == (WIDTH * HEIGHT, COUNT)
     assert kept.nbytes > 0
     signal = float32(rng.normal(size=(COUNT, channels)))
@@ -158,17 +158,17 @@ def test_csr_can_keep_the_strongest_only(backend, rng, camera, scene, of_pixels)
         assert (row.diff() >= -1e-6 * row[1:]).all(), "still front to back"
 
 
-@pytest.mark.parametrize("layout", ["csr", "blocks"])
-def test_an_empty_scene_has_an_empty_matrix(backend, rng, camera, layout):
-    kept = backend.weights(random_gaussians(rng, 0), camera, layout=layout)
+@pytest.mark.parametrize("kind", ["weights", "image_weights"])
+def test_an_empty_scene_has_an_empty_matrix(backend, rng, camera, kind):
+    kept = getattr(backend, kind)(random_gaussians(rng, 0), camera)
     assert kept.shape == (WIDTH * HEIGHT, 0)
     assert not kept.product(torch.zeros(0, 4)).any()
     assert kept.adjoint(torch.ones(WIDTH * HEIGHT, 4)).shape == (0, 4)
 
 
-@pytest.mark.parametrize("layout", ["csr", "blocks"])
-def test_kept_weights_refuse_other_shapes(backend, camera, scene, layout):
-    kept = backend.weights(scene, camera, layout=layout)
+@pytest.mark.parametrize("kind", ["weights", "image_weights"])
+def test_kept_weights_refuse_other_shapes(backend, camera, scene, kind):
+    kept = getattr(backend, kind)(scene, camera)
     with pytest.raises(InputError, match="signal"):
         kept.product(torch.zeros(COUNT + 1, 2))
     with pytest.raises(InputError, match="image"):
@@ -182,7 +182,3 @@ def test_what_cannot_be_asked_for(backend, camera, scene):
         backend.contributors(scene, camera, torch.tensor([[0, -1]]), 1)
     with pytest.raises(RangeError, match="k: "):
         backend.contributors(scene, camera, torch.tensor([[0, 0]]), 0)
-    with pytest.raises(InputError, match="layout"):
-        backend.weights(scene, camera, None, 3, layout="blocks")
-    with pytest.raises(InputError, match="layout"):
-        backend.weights(scene, camera, layout="rows")

@@ -1,5 +1,7 @@
-"""The same bits whatever the number of threads, and from one call to the next."""
+"""Renders in threads and in forked processes."""
 
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -32,7 +34,7 @@ def _everything(bench, rng) -> dict[str, torch.Tensor]:
     wide.image.square().sum().backward()
     back = bench.back_project(scene, camera, image)
     csr = bench.weights(scene, camera)
-    blocks = bench.weights(scene, camera, layout="blocks")
+    blocks = bench.image_weights(scene, camera)
     pixels = torch.stack((torch.arange(90), torch.arange(90)), dim=1)
     rows = bench.contributors(scene, camera, pixels, 5)
     return {
@@ -96,3 +98,44 @@ def test_the_portable_path_is_always_there(rng):
         assert splat.render(scene, camera, backend="cpu").alpha.any()
     finally:
         set_isa(before)
+
+
+# A forked child has none of its parent's threads: it must neither hang nor draw otherwise.
+
+
+# In a process of its own: no fork survives the threads that torch has started for other tests.
+FORKING = """
+import os, signal, warnings
+import torch
+from splatseg.core import Camera, Gaussians
+from splatseg.render import render
+from splatseg.render.cpu import set_threads
+
+warnings.simplefilter("ignore", DeprecationWarning)
+torch.set_num_threads(1)
+g = torch.Generator().manual_seed(3)
+n = 500
+scene = Gaussians(
+    means=torch.randn(n, 3, generator=g) + torch.tensor([0.0, 0.0, 4.0]),
+    rotations=torch.randn(n, 4, generator=g),
+    scales=torch.rand(n, 3, generator=g) * 0.2,
+    opacities=torch.rand(n, generator=g),
+    sh=torch.randn(n, 4, 3, generator=g),
+)
+camera = Camera(width=150, height=100, fx=120, fy=120, cx=75, cy=50, cam_from_world=torch.eye(4))
+set_threads(3)
+parent = render(scene, camera).image
+child = os.fork()
+if child == 0:
+    signal.alarm(30)  # a hang ends the child with a signal, which the parent sees
+    os._exit(0 if torch.equal(render(scene, camera).image, parent) else 3)
+print("child", os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+print("parent", torch.equal(render(scene, camera).image, parent), float(parent.max()) > 0)
+"""
+
+
+def test_a_forked_child_draws_the_same_picture() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", FORKING], check=False, capture_output=True, text=True, timeout=120
+    )
+    assert done.stdout.split("\n")[:2] == ["child 0", "parent True True"], done.stderr

@@ -18,7 +18,7 @@ from splatseg.report.street_report import (
     street_report,
 )
 from splatseg.street.geometry import GeometryRecord
-from splatseg.street.radiance import RadianceRecord
+from splatseg.street.radiance_training import RadianceRecord
 
 CLASSES = ClassTable(
     rows=(ClassInfo(id=1, name="road", colour=(9, 9, 9)), ClassInfo(id=7, name="car & van"))

@@ -8,10 +8,9 @@ import torch
 from splatseg import _native
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.street.hits import MAX_HITS, MeshCaster
-from splatseg.street.hits_reference import mesh_hits
-from splatseg.street.mesh import PrimitiveMesh
-from splatseg.street.shapes import template
-from splatseg.street.shapes.template import FACES, VERTICES
+from splatseg.street.primitives import PrimitiveMesh
+from splatseg.street.shapes import FACES, VERTICES, template
+from street.reference import mesh_hits
 
 
 def balls(*places: tuple[float, float, float], radius: float = 1.0, levels=None) -> PrimitiveMesh:

@@ -12,7 +12,7 @@ from splatseg.io.captures import read_capture
 from splatseg.io.evidence import open_evidence
 from splatseg.io.scans import read_scans
 from splatseg.methods import MethodInputs, find_method, keeps_ids, method_names
-from splatseg.street.options import PUBLISHED, DnmpOptions
+from splatseg.street.build import PUBLISHED, DnmpOptions
 
 QUICK = DnmpOptions(voxels=(0.8,), geometry_iterations=1, iterations=150, rays=256)
 
@@ -54,15 +54,12 @@ def test_published_settings_are_those_of_the_papers() -> None:
     """
     published = find_method("dnmp").published_options
     assert published.voxels == (0.5, 1.0)
-    assert (published.coarse, published.start) == ("everywhere", "sphere")
-    assert published.asked_vertices == "adjusted"
+    assert published.effective_vertex_rule == "adjusted"
     assert published.radius is None, "the side of the finest voxels"
     geometry = published.geometry
     assert (geometry.iterations, geometry.rays, geometry.error) == (5_000, 4_096, "ray")
     assert (geometry.rate, geometry.offset_rate, geometry.depth_weight) == (5e-4, 5e-4, 0.05)
     assert geometry.final_rate == pytest.approx(0.99501248, abs=1e-6), "0.999999 a step"
-    assert (geometry.normal_weight, geometry.laplacian_weight, geometry.edge_weight) == (0, 0, 0)
-    assert (geometry.truncation, geometry.distance_power) == (math.inf, 0.0)
     assert geometry.carve == math.inf, "nothing is carved"
     assert (geometry.refresh, geometry.reuse) == (100, 1)
     field = published.radiance
@@ -72,10 +69,9 @@ def test_published_settings_are_those_of_the_papers() -> None:
     assert (field.feature_size, field.feature_frequencies) == (3, 3)
     assert (field.semantic_width, field.colour_widths) == (128, (256, 256))
     assert (field.position_frequencies, field.view_frequencies) == (6, 4)
-    assert field.view_encoding == "normal_view"
     assert (field.max_hits, field.fine_hits, field.coarse_hits) == (6, 4, 2)
     assert (field.order, field.sides) == ("levels", "both")
-    assert (field.rate, field.feature_rate, field.final_rate) == (5e-4, 5e-4, 0.1)
+    assert (field.rate, field.feature_rate) == (5e-4, 5e-4)
 
 
 def test_gaussians_take_the_labels_of_the_field_and_far_ones_none(inputs, generated_drive) -> None:
@@ -111,18 +107,17 @@ def test_without_gaussians_there_is_nothing_to_label(inputs) -> None:
     ("values", "words"),
     [
         ({"setting": "slow"}, "setting: expected one of"),
-        ({"coarse": "all"}, "coarse: expected one of"),
-        ({"start": "cube"}, "start: expected one of"),
-        ({"voxels": ()}, "voxels: expected positive lengths"),
-        ({"voxels": (0.5, -1.0)}, "voxels: expected positive lengths"),
-        ({"iterations": 0}, "iterations: expected 1 or more, got 0"),
-        ({"rays": 0}, "rays: expected 1 or more"),
-        ({"geometry_iterations": -1}, "geometry_iterations: expected 0 or more"),
+        ({"coarse": "sparse"}, "coarse: this option was removed; all levels"),
+        ({"start": "encoded"}, "start: this option was removed"),
+        ({"voxels": ()}, "voxels: expected at least one length"),
+        ({"voxels": (0.5, -1.0)}, r"voxels\[1\]: expected more than 0"),
+        ({"iterations": 0}, "iterations: expected at least 1, got 0"),
+        ({"rays": 0}, "rays: expected at least 1"),
+        ({"geometry_iterations": -1}, "geometry_iterations: expected at least 0"),
         ({"vertex_rule": "near"}, "vertex_rule: expected one of"),
-        ({"carve": 0.0}, "carve: expected a positive number"),
-        ({"radius": float("nan")}, "radius: expected a positive number"),
-        ({"semantic_weight": -1.0}, "semantic_weight: expected 0 or more"),
-        ({"memory": -1}, "memory: expected 0 or more"),
+        ({"carve": 0.0}, "carve: expected more than 0"),
+        ({"radius": float("nan")}, "radius: expected more than 0"),
+        ({"semantic_weight": -1.0}, "semantic_weight: expected at least 0"),
     ],
 )
 def test_options_check_themselves(values: dict[str, object], words: str) -> None:
@@ -132,17 +127,16 @@ def test_options_check_themselves(values: dict[str, object], words: str) -> None
 
 def test_every_option_reaches_the_stage_that_it_is_of() -> None:
     given = DnmpOptions(
-        geometry_iterations=7, carve=0.7, iterations=11, rays=33, semantic_weight=0.4, memory=99
+        geometry_iterations=7, carve=0.7, iterations=11, rays=33, semantic_weight=0.4
     )
     assert (given.geometry.iterations, given.geometry.carve) == (7, 0.7)
     radiance = given.radiance
     assert (radiance.iterations, radiance.rays, radiance.semantic_weight) == (11, 33, 0.4)
-    assert radiance.cache_memory == 99
     fast, published = DnmpOptions(), DnmpOptions(setting="published")
     assert fast.geometry.carve == 0.9
-    assert (fast.asked_vertices, published.asked_vertices) == ("weighed", "adjusted")
+    assert (fast.effective_vertex_rule, published.effective_vertex_rule) == ("weighed", "adjusted")
     for rule in ("adjusted", "weighed", "all"):
-        assert replace(published, vertex_rule=rule).asked_vertices == rule
+        assert replace(published, vertex_rule=rule).effective_vertex_rule == rule
     assert published.geometry.carve > 1
     assert published.radiance.width == 256 > fast.radiance.width
     assert replace(published, iterations=5).radiance.iterations == 5

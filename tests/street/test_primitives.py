@@ -1,4 +1,4 @@
-"""Voxels that hold points become primitives, level by level."""
+"""Primitives, and what becomes of a mesh."""
 
 from dataclasses import replace
 from typing import Any
@@ -8,13 +8,19 @@ import pytest
 import torch
 
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.street.primitives import Primitives, voxel_primitives, world_vertices
+from splatseg.street.primitives import (
+    PrimitiveMesh,
+    Primitives,
+    primitive_faces,
+    voxel_primitives,
+    world_vertices,
+)
 from splatseg.street.shapes import (
-    ShapeAutoEncoder,
     ShapeConfig,
     new_shapes,
     primitive_scale,
     sphere_code,
+    template,
 )
 from support.primitives import shipped, sphere, spheres
 
@@ -43,11 +49,10 @@ def test_each_voxel_with_a_point_has_one_primitive_a_level(rng: np.random.Genera
     assert made.sizes == (0.5, 1.0)
 
 
-@pytest.mark.parametrize("start", ["sphere", "encoded"])
-def test_the_order_of_points_is_free(start: str, rng: np.random.Generator) -> None:
+def test_the_order_of_points_is_free(rng: np.random.Generator) -> None:
     points = cloud(rng)
-    one = voxels(points, start=start)
-    two = voxels(points[torch.from_numpy(rng.permutation(len(points)))], start=start)
+    one = voxels(points)
+    two = voxels(points[torch.from_numpy(rng.permutation(len(points)))])
     assert torch.equal(one.centres, two.centres)
     assert torch.equal(one.codes, two.codes)
 
@@ -74,27 +79,6 @@ def test_points_all_in_one_voxel_have_one_primitive_a_level() -> None:
     torch.testing.assert_close(made.centres, torch.full((2, 3), 0.2), atol=1e-3, rtol=0)
 
 
-def test_a_sparse_coarse_level_takes_what_the_fine_one_left() -> None:
-    dense = torch.full((3, 3), 0.2)
-    lonely = torch.tensor([[0.7, 0.2, 0.2], [5.2, 0.2, 0.2]])
-    points = torch.cat((dense, lonely))
-    made = voxels(points, coarse="sparse", min_points=2)
-    assert made.levels.tolist() == [0, 1, 1]
-    torch.testing.assert_close(made.centres[1:], lonely, atol=1e-3, rtol=0)
-    everywhere = voxels(points, min_points=2)
-    assert everywhere.levels.tolist() == [0, 1]
-    assert everywhere.centres[1, 0].item() == pytest.approx((3 * 0.2 + 0.7) / 4, abs=1e-3)
-
-
-def test_encoded_codes_are_those_of_the_points(rng: np.random.Generator) -> None:
-    inside = torch.from_numpy(rng.uniform(0.02, 0.48, size=(50, 3)))
-    few = inside[:7] + torch.tensor([3.0, 0, 0])
-    made = voxels(torch.cat((inside, few)), sizes=(0.5,), start="encoded")
-    local = (inside - made.centres[0]) / primitive_scale(0.5)
-    torch.testing.assert_close(made.codes[0], shipped().encode(local.float()[None])[0])
-    torch.testing.assert_close(made.codes[1], sphere())
-
-
 def test_the_sphere_is_searched_for_where_none_is_given() -> None:
     shapes = new_shapes(ShapeConfig(code_size=3, encoder_widths=(4,), decoder_widths=(4,)), seed=0)
     made = voxel_primitives(torch.zeros(1, 3), shapes=shapes, sizes=(1.0,))
@@ -111,9 +95,6 @@ def test_the_sphere_is_searched_for_where_none_is_given() -> None:
         (torch.zeros(2, 3), {"sizes": (0.5, 0.0)}, "sizes: expected positive"),
         (torch.zeros(2, 3), {"sizes": ()}, "sizes: expected positive"),
         (torch.zeros(2, 3), {"metres_per_unit": 0.0}, "metres_per_unit: expected a positive"),
-        (torch.zeros(2, 3), {"min_points": 3}, "expected voxels with 3 points each"),
-        (torch.zeros(2, 3), {"coarse": "never"}, "coarse: expected one of"),
-        (torch.zeros(2, 3), {"start": "cube"}, "start: expected one of"),
     ],
 )
 def test_bad_points_and_options_are_refused(
@@ -121,12 +102,6 @@ def test_bad_points_and_options_are_refused(
 ) -> None:
     with pytest.raises(InputError, match=message):
         voxels(points, **options)
-
-
-def test_encoding_needs_an_encoder() -> None:
-    decoder = ShapeAutoEncoder(shipped().config, has_encoder=False)
-    with pytest.raises(InputError, match="encoder"):
-        voxel_primitives(torch.zeros(9, 3), shapes=decoder, sphere=sphere(), start="encoded")
 
 
 def test_vertices_are_decoded_scaled_and_moved() -> None:
@@ -181,3 +156,57 @@ def test_no_primitives_are_primitives() -> None:
     none = spheres(torch.zeros(0, 3))
     assert len(none) == 0
     assert len(none.mesh(shipped())) == 0
+
+
+# Primitives as one mesh: vertices and faces in the order of primitives.
+
+
+def two() -> dict[str, Any]:
+    vertices, _ = template()
+    return {
+        "vertices": torch.cat((vertices, vertices + 5)),
+        "levels": torch.tensor([0, 1]),
+        "sizes": (0.5, 1.0),
+    }
+
+
+def test_faces_of_a_primitive_have_its_own_vertices() -> None:
+    mesh = PrimitiveMesh(**two())
+    _, faces = template()
+    assert len(mesh) == 2
+    assert torch.equal(mesh.faces, torch.cat((faces, faces + 42)))
+    assert mesh.vertices.dtype == torch.float32
+    assert mesh.levels.dtype == torch.int64
+
+
+def test_faces_look_outwards() -> None:
+    mesh = PrimitiveMesh(**two())
+    a, b, c = mesh.vertices[mesh.faces].unbind(dim=1)
+    middles = torch.tensor([0.0, 5.0]).repeat_interleave(80)[:, None]
+    assert bool(((torch.linalg.cross(b - a, c - a) * (a - middles)).sum(1) > 0).all())
+
+
+def test_no_primitives_have_no_faces() -> None:
+    assert primitive_faces(0).shape == (0, 3)
+    mesh = PrimitiveMesh(
+        vertices=torch.zeros(0, 3), levels=torch.zeros(0, dtype=torch.int64), sizes=(1.0,)
+    )
+    assert len(mesh) == 0
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"vertices": torch.zeros(83, 3)}, ShapeError, "vertices: expected shape"),
+        ({"vertices": torch.full((84, 3), torch.nan)}, RangeError, "vertices: .* not finite"),
+        ({"levels": torch.tensor([0, 2])}, RangeError, "levels: expected levels of 2 sizes"),
+        ({"levels": torch.tensor([-1, 0])}, RangeError, "levels: expected levels of 2 sizes"),
+        ({"sizes": (1.0, 0.5)}, RangeError, "sizes: expected positive lengths, ascending"),
+        ({"sizes": (0.0, 0.5)}, RangeError, "sizes: expected positive lengths"),
+    ],
+)
+def test_poisoned_meshes_are_refused(
+    change: dict[str, Any], error: type[InputError], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        PrimitiveMesh(**(two() | change))

@@ -4,10 +4,9 @@ import torch
 
 from splatseg.core import LayerInfo
 from splatseg.street.field import MeshField
-from splatseg.street.mesh import PrimitiveMesh
-from splatseg.street.radiance.model import RadianceModel
-from splatseg.street.radiance.options import RadianceOptions
-from splatseg.street.shapes.template import template
+from splatseg.street.primitives import PrimitiveMesh
+from splatseg.street.radiance import RadianceModel, RadianceOptions
+from splatseg.street.shapes import template
 
 SMALL = RadianceOptions(
     max_hits=6,
@@ -61,8 +60,8 @@ def told_field(
         fine_hits=4,
         coarse_hits=2,
         sides="both",
-        feature_size=3, position_frequencies=0, view_encoding="none", width=3, depth=1,
-        semantic_width=0, colour_widths=(), background="constant", background_widths=(),
+        feature_size=3, position_frequencies=0, view_frequencies=0, width=3, depth=1,
+        semantic_width=0, colour_widths=(), background_widths=(),
     )  # fmt: skip
     model = RadianceModel(mesh, IDS, options)
     eye = torch.eye(3)
@@ -75,7 +74,7 @@ def told_field(
         model.trunk.layers[0].weight[:, :3] = eye
         model.opacity.bias.fill_(opaque)
         model.semantic.layers[0].weight.copy_(40 * eye)
-        model.colour.layers[0].weight.copy_(80 * eye)
+        model.colour.layers[0].weight[:, :3] = 80 * eye
         model.colour.layers[0].bias.fill_(-40)
         last = model.background.layers[0]
         last.bias.fill_(-40)

@@ -3,6 +3,8 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -10,11 +12,15 @@ from PIL import Image
 
 from splatseg.core import Camera, Capture
 from splatseg.io.pointmaps import RecordedPointmaps, create_pointmaps
-from splatseg.pose.pointmaps._samples import PairSamples, PhotographSize, read_samples
+from splatseg.pose import pointmaps
+from splatseg.pose._pointmap_align import Aligned
+from splatseg.pose._pointmap_pixels import PairSamples, PhotographSize, read_samples
+from splatseg.pose.pointmaps import PointmapOptions, solve
 from splatseg.synthetic import SyntheticScene, cameras, cast, room
 from splatseg_bench.worlds import PointmapErrors, SyntheticPointmaps, synthetic_pointmaps
 
 WIDTH, HEIGHT = 96, 72
+STEPS = ("_ROBUST_ITERATIONS", "_PUBLISHED_ITERATIONS")
 EXACT = PointmapErrors(noise=0, warp=0, wrong_confidence=0)
 
 
@@ -153,3 +159,15 @@ def aligned_cameras(room: PhotographedRoom, aligned: object) -> dict[str, Camera
             cam_from_world=pose,
         )  # fmt: skip
     return found
+
+
+def solved(
+    samples: PairSamples, *, iterations: int | None = None, block: int = 50, **options: Any
+) -> Aligned:
+    """The alignment of samples; in fewer steps or smaller blocks than it has by itself."""
+    steps = {} if iterations is None else dict.fromkeys(STEPS, iterations)
+    with (
+        patch.dict(vars(pointmaps), steps),
+        patch("splatseg.pose._pointmap_align._BLOCK", block),
+    ):
+        return solve(samples, options=PointmapOptions(**options), progress=lambda done, total: None)

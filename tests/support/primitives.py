@@ -5,7 +5,8 @@ import functools
 import torch
 
 from splatseg.street.primitives import Primitives
-from splatseg.street.shapes import ShapeAutoEncoder, load_shapes, sphere_code
+from splatseg.street.shape_files import load_shapes
+from splatseg.street.shapes import ShapeAutoEncoder, sphere_code
 
 
 @functools.cache

@@ -36,8 +36,7 @@ DEPTH = [("dpt", "dpt"), ("depth-anything", "depth_anything"),
          ("depth-anything", "depth_anything_metric")]  # fmt: skip
 MANY = {"min_score": 0.2, "min_visible": 0.05, "mask_threshold": 0.3}
 FEW = FitOptions(minutes=None, steps=3, max_gaussians=300)
-SOLID = replace(FEW, start_opacity=0.95, quarter_until=0, half_until=0, depth_weight=5.0)
-"""Opaque from the start: depth counts where something is seen."""
+SOLID = replace(FEW, rates="published", depth_weight=5.0)
 
 
 @pytest.fixture(scope="module")
@@ -111,8 +110,12 @@ def test_depth_is_fitted_and_not_segmented(made, small_room, weights, tmp_path, 
 
 
 @pytest.fixture
-def capture(small_room, tmp_path) -> Path:
-    """The room with evidence of its true depth, in metres, in the depth_true of the capture."""
+def capture(small_room, tmp_path, monkeypatch) -> Path:
+    """The room with evidence of its true depth, in metres, in the depth_true of the capture.
+
+    Fits are opaque from the start, so that depth counts where something is seen.
+    """
+    monkeypatch.setattr("splatseg.fit._start.START_OPACITY", 0.95)
     folder = shutil.copytree(small_room, tmp_path / "capture")
     (folder / "depth_true").mkdir()
     for view in read_capture(folder).train_views:

@@ -12,7 +12,7 @@ from PIL import Image
 from splatseg.cli.fit import Command, _options
 from splatseg.core import PointCloud, Scan
 from splatseg.errors import InputError
-from splatseg.fit import FitOptions, ScanDepthOptions
+from splatseg.fit import FitOptions
 from splatseg.io.captures import read_capture
 from splatseg.io.depths import load_depth
 from splatseg.io.scene import load_scene
@@ -70,14 +70,12 @@ def test_views_get_depths_and_the_capture_points(small_room, walls, tmp_path) ->
     assert "give" in told[0]
 
 
-def test_options_and_units_count(small_room, walls, tmp_path) -> None:
+def test_cells_and_units_count(small_room, walls, tmp_path, monkeypatch) -> None:
     given = replace(read_capture(small_room), points=None)
     counts = []
     for cell in (0.12, 0.6):
-        found = with_scans(
-            given, Scans({"0": walls}), scene=tmp_path, report=lambda _: None,
-            options=ScanDepthOptions(start_cell=cell),
-        )  # fmt: skip
+        monkeypatch.setattr("splatseg.tasks._scan_depth._START_CELL", cell)
+        found = with_scans(given, Scans({"0": walls}), scene=tmp_path, report=lambda _: None)
         assert found.points is not None
         counts.append(len(found.points))
     assert counts[1] < counts[0] / 4

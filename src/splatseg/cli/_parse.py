@@ -72,10 +72,12 @@ def _readable(command: type[Any], names: Collection[str]) -> type[Any]:
         names: All options of the command, which texts name in backticks.
     """
     hints = get_type_hints(command, include_extras=True)
+    kinds = get_type_hints(command)  # without the ranges that options declare, inside of lists too
     texts = _texts(command)
     made: list[tuple[str, Any, Any]] = []
     for field in dataclasses.fields(command):
-        kind, notes = _unwrapped(hints[field.name])
+        kind: Any = kinds[field.name]
+        _, notes = _unwrapped(hints[field.name])
         default = field.default
         factory = field.default_factory
         if dataclasses.is_dataclass(kind):

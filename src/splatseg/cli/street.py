@@ -17,8 +17,8 @@ from splatseg.io.scene import scene_field_path
 from splatseg.io.scene_folder import is_scene
 from splatseg.report.maps import LabelledPoints
 from splatseg.report.words import counted
+from splatseg.street.build import DnmpOptions
 from splatseg.street.field import VERTEX_WORDS
-from splatseg.street.options import DnmpOptions
 from splatseg.tasks import (
     LabelBy,
     LabelledScans,

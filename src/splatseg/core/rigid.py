@@ -179,6 +179,62 @@ class Similarity:
         )
 
 
+def nearest_rotation(
+    correlation: Float[Tensor, "*batch 3 3"],
+) -> tuple[Float[Tensor, "*batch 3 3"], Float[Tensor, "*batch 3"]]:
+    """The rotation nearest to a matrix, and the signed singular values (Kabsch 1976)."""
+    left, values, right = torch.linalg.svd(correlation)
+    sign = torch.ones_like(values)
+    sign[..., 2] = torch.linalg.det(left @ right).sign()
+    return (left * sign[..., None, :]) @ right, values * sign
+
+
+def best_similarity(
+    source: Float[Tensor, "*batch n 3"],
+    target: Float[Tensor, "*batch n 3"],
+    weights: Float[Tensor, "*batch n"],
+) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3 3"], Float[Tensor, "*batch 3"]]:
+    """Scale, rotation and translation that bring `source` nearest to `target`, many at once.
+
+    References:
+        Umeyama, Least-squares estimation of transformation parameters between two point
+        patterns, PAMI 1991.
+    """
+    share = weights / weights.sum(dim=-1, keepdim=True).clamp_min(1e-30)
+    mean_source, mean_target = (
+        (share.unsqueeze(-1) * points).sum(dim=-2, keepdim=True) for points in (source, target)
+    )
+    a, b = source - mean_source, target - mean_target
+    rotation, values = nearest_rotation(b.mT @ (weights.unsqueeze(-1) * a))
+    spread = (weights * a.square().sum(-1)).sum(-1)
+    scale = values.sum(-1) / spread.clamp_min(1e-30)
+    turned = (rotation @ mean_source.mT).squeeze(-1)
+    return scale, rotation, mean_target[..., 0, :] - scale[..., None] * turned
+
+
+def similarity_between(
+    source: Float[Tensor, "n 3"],
+    target: Float[Tensor, "n 3"],
+    *,
+    weights: Float[Tensor, "n"] | None = None,
+    with_scale: bool = True,
+) -> "Similarity | None":
+    """The least-squares similarity target_from_source (`best_similarity`), float64.
+
+    None where the points do not determine a positive scale. Without `with_scale` the scale is 1.
+    """
+    one, two = source.double(), target.double()
+    counted = torch.ones(len(one), dtype=torch.float64) if weights is None else weights.double()
+    scale, rotation, translation = best_similarity(one, two, counted)
+    if with_scale and not 0 < float(scale) < float("inf"):
+        return None
+    if not with_scale:
+        mean = (counted[:, None] * one).sum(dim=0) / counted.sum()
+        translation = translation + (scale - 1) * (rotation @ mean)
+        scale = torch.ones_like(scale)
+    return Similarity(rotation=rotation, translation=translation, scale=float(scale))
+
+
 def upright(
     points: Float[Tensor, "n 3"], up: tuple[float, float, float] | None
 ) -> Float[Tensor, "n 3"]:

@@ -10,8 +10,7 @@ from torch import Tensor
 
 from splatseg.core import Camera, View
 from splatseg.core.boundary import boundary
-from splatseg.fit._background import fixed_colour
-from splatseg.fit._options import FitOptions
+from splatseg.fit._options import FitOptions, fixed_colour
 from splatseg.io.images import image_camera, load_alpha, load_image, load_mask, reduced_size
 from splatseg.render.warp import photograph_to_pinhole, undistorted_camera
 
@@ -39,7 +38,7 @@ class Example:
     """Opacity of each pixel, [0, 1]; None is opaque everywhere."""
 
 
-class Photographs:
+class TrainingPhotographs:
     """Training views by index. Pixels are read at first use.
 
     Photographs with distortion are resampled into ``camera.undistorted()``; pixels outside the
@@ -48,7 +47,7 @@ class Photographs:
     to be blended over a colour other than white.
 
     Example:
-        photographs = Photographs(capture.train_views, longest=1600)
+        photographs = TrainingPhotographs(capture.train_views, longest=1600)
         example = photographs.example(0, reduction=2)
     """
 
@@ -69,7 +68,7 @@ class Photographs:
         self._cameras = [undistorted_camera(image_camera(view, longest)) for view in self._views]
 
     @classmethod
-    def of(cls, views: Sequence[View], *, options: FitOptions) -> "Photographs":
+    def of(cls, views: Sequence[View], *, options: FitOptions) -> "TrainingPhotographs":
         """The photographs of views with the options of a fit."""
         return cls(
             views,

@@ -1,33 +1,200 @@
-"""One fit in progress: its state, and its steps around the shared `TrainingStep`."""
+"""The fit: one view after another is rendered, compared and optimised."""
 
 import math
 import time
-from dataclasses import asdict
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
 from typing import Any, cast
 
 import torch
 
-from splatseg.core import Camera, Capture, Gaussians
-from splatseg.errors import FileFormatError
-from splatseg.fit._density import density_of
-from splatseg.fit._initialise import initial_parameters, scene_extent, scene_size
-from splatseg.fit._loss import Loss
-from splatseg.fit._options import FitOptions
-from splatseg.fit._parameters import Parameters, final_gaussians
-from splatseg.fit._photographs import Photographs
-from splatseg.fit._records import FitProgress, FitRecord
-from splatseg.fit._schedule import degree_at, rates_at, reduction_at
-from splatseg.fit._start import with_start_points
-from splatseg.fit._state import FitState, StatefulModule, named, parameters_of
-from splatseg.fit._step import StepGradients, StepSettings, TrainingStep
-from splatseg.fit._update import UpdateSettings
-from splatseg.fit._view_modules import ViewModules
-from splatseg.render import Backend, default_options
+from splatseg.core import Camera, Capture, Gaussians, View
+from splatseg.core.boundary import boundary
+from splatseg.core.checkpoints import Checkpoints, Interrupts, deferred_interrupts
+from splatseg.core.threads import one_torch_thread
+from splatseg.errors import FileFormatError, InputError
+from splatseg.fit._checkpoint import (
+    CheckpointClock,
+    FitState,
+    StatefulModule,
+    fit_identity,
+    named,
+    parameters_of,
+)
+from splatseg.fit._density import strategy_of
+from splatseg.fit._options import DEAD_OPACITY, FitOptions
+from splatseg.fit._parameters import (
+    Parameters,
+    UpdateSettings,
+    degree_at,
+    final_gaussians,
+    rates_at,
+    reduction_at,
+)
+from splatseg.fit._photographs import TrainingPhotographs
+from splatseg.fit._refine import without_floaters
+from splatseg.fit._start import initial_parameters, scene_extent, scene_size, with_start_points
+from splatseg.fit._step import Loss, StepGradients, StepSettings, TrainingStep
+from splatseg.fit._views import Exposure, ViewModules
+from splatseg.render import Backend, default_options, get_backend
 
 _RECORD_EVERY = 50  # steps
 # Noise and the penalty on scales are tuned for a scene of this size (`scene_size`) and scaled to
 # others. In millimetres, unscaled, the noise moved four of five Gaussians out of all views.
 _REFERENCE_SIZE = 3.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FitRecord:
+    """Means over some consecutive steps of a fit."""
+
+    step: int
+    """The last of them."""
+
+    seconds: float
+    """Since the fit began."""
+
+    loss: float
+    psnr: float
+    """dB."""
+
+    count: int
+    """Gaussians at the end."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FitResult:
+    """Result of a fit."""
+
+    gaussians: Gaussians
+    """On the CPU, float32, without those of negligible opacity."""
+
+    steps: int
+    """Steps done."""
+
+    seconds: float
+    """Wall-clock time, reading the photographs included."""
+
+    history: tuple[FitRecord, ...]
+    """One record for every 50 steps."""
+
+    interrupted: bool
+    """True if Ctrl-C ended it early; the Gaussians are those of that moment."""
+
+    stages: Mapping[str, float] = field(default_factory=dict[str, float])
+    """Seconds spent in each stage of a step: read, gather, render, loss, backward, update,
+    densify."""
+
+    views: tuple[View, ...] = ()
+    """The capture's views; with `FitOptions.refine_poses` training views have the refined poses,
+    aligned to the given ones."""
+
+    notes: tuple[str, ...] = ()
+    """Sentences on what was optimised besides the Gaussians: exposures, poses."""
+
+    exposures: Mapping[str, Exposure] = field(default_factory=dict[str, Exposure])
+    """Exposure of each training view, by its name; empty without `FitOptions.exposure`."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FitProgress:
+    """Progress of a fit after a step."""
+
+    step: int
+    """Steps done."""
+
+    progress: float
+    """Share of the fit that is done, [0, 1]."""
+
+    seconds: float
+    """Since the fit began."""
+
+    seconds_left: float
+    """Estimated remaining time."""
+
+    loss: float
+    """Of this step's view."""
+
+    psnr: float
+    """Of this step's view, dB, at the resolution of the stage."""
+
+    count: int
+    """Gaussians."""
+
+
+@boundary
+def fit(
+    capture: Capture,
+    *,
+    options: FitOptions = FitOptions(),
+    backend: str = "auto",
+    progress: Callable[[FitProgress], None] | None = None,
+    checkpoints: Checkpoints | None = None,
+) -> FitResult:
+    """Optimise Gaussians so that their renders match the training photographs of a capture.
+
+    Starts from the capture's points, minimises L1 + D-SSIM with Adam, one view a step, from
+    coarse to fine, with density control. Test views are not used. With `FitOptions.steps` the
+    result depends on the seed alone, not on the number of threads or the speed of the machine.
+
+    Args:
+        capture: TrainingPhotographs with cameras and start points.
+        options: Length, size and learning rates.
+        backend: Name of the renderer: ``auto``, ``cpu``, ``cuda`` or ``reference``.
+        progress: Called after every step. A `KeyboardInterrupt` raised by it, Ctrl-C or SIGTERM
+            ends the fit after the current step; the result so far is returned. The third signal
+            interrupts at once.
+        checkpoints: Where checkpoints are written, to resume after an interruption or a crash.
+            A resumed fit gives the result of an uninterrupted one. None writes none.
+
+    Raises:
+        InputError: If the capture has no training photographs or no start points, or the
+            checkpoint to resume from has other data or options.
+        MissingFileError: If a photograph is missing.
+        FileFormatError: If the checkpoint to resume from is damaged.
+        SplatsegError: If the loss is no longer a number.
+    """
+    renderer = get_backend(backend)
+    views = tuple(view for view in capture.train_views if view.image is not None)
+    if not views:
+        raise InputError(
+            f"{capture.path}: expected training views with photographs, got none "
+            f"among {len(capture.views)} views."
+        )
+    clock = None
+    if checkpoints is not None:
+        identity = fit_identity(capture, views, options=options, backend=renderer.name)
+        clock = CheckpointClock(checkpoints, identity=identity)
+    photographs = TrainingPhotographs.of(views, options=options)
+    saved = None if clock is None else clock.saved()
+    with one_torch_thread():
+        run = FitRun(capture, options, renderer, photographs, saved=saved)
+    with deferred_interrupts() as interrupts, one_torch_thread():
+        interrupted = _run_steps(run, interrupts, clock=clock, progress=progress)
+        at_end = checkpoints is not None and checkpoints.at_end
+        if (interrupted or at_end) and run.between_steps and not interrupts.forced:
+            _write_checkpoint(run, clock)
+    with one_torch_thread():
+        gaussians, refined = run.gaussians(), run.views.refined(capture.views)
+        notes = run.views.notes()
+        if options.prune_floaters and not interrupted:
+            pruned = without_floaters(gaussians, photographs, refined, backend=renderer.name)
+            note = (
+                f"{len(gaussians) - len(pruned)} of {len(gaussians)} Gaussians are left out, which "
+                "no photograph needs."
+            )
+            gaussians, notes = pruned, (*notes, note)
+    return FitResult(
+        gaussians=gaussians,
+        steps=run.steps,
+        seconds=run.seconds,
+        history=tuple(run.history),
+        interrupted=interrupted,
+        stages=dict(run.stages),
+        views=refined,
+        notes=notes,
+        exposures=run.views.learned_exposures(),
+    )
 
 
 class FitRun:
@@ -43,7 +210,7 @@ class FitRun:
         capture: Capture,
         options: FitOptions,
         backend: Backend,
-        photographs: Photographs,
+        photographs: TrainingPhotographs,
         *,
         saved: FitState | None = None,
     ) -> None:
@@ -83,7 +250,7 @@ class FitRun:
             self._state = (start, start.zeros_like(), start.zeros_like())
         else:
             self._restore(saved)
-        self._density = density_of(
+        self._density = strategy_of(
             options, start=self._start_count, extent=self._extent, device=self._device
         )
         if saved is not None:
@@ -113,7 +280,7 @@ class FitRun:
     def gaussians(self) -> Gaussians:
         found = final_gaussians(self._state[0])
         if self._options.strategy != "fixed":
-            found = found[found.opacities > self._options.dead_opacity]
+            found = found[found.opacities > DEAD_OPACITY]
         return self.views.in_capture_frame(
             found.replace(
                 antialiased=self._options.antialiased, low_pass=self._options.low_pass_drawn
@@ -261,3 +428,30 @@ class FitRun:
             self.history.append(record)
             self._batch = []
         return status
+
+
+def _run_steps(
+    run: FitRun,
+    interrupts: Interrupts,
+    *,
+    clock: CheckpointClock | None,
+    progress: Callable[[FitProgress], None] | None,
+) -> bool:
+    """Step until the fit is finished or interrupted. Returns whether it was interrupted."""
+    interrupted = False
+    try:
+        while not (run.finished or interrupts.requested):
+            status = run.step()
+            if progress is not None:
+                progress(status)
+            if clock is not None and clock.due(run.steps):
+                _write_checkpoint(run, clock)
+    except KeyboardInterrupt:
+        interrupted = True
+    return not run.finished and (interrupted or interrupts.requested)
+
+
+def _write_checkpoint(run: FitRun, clock: CheckpointClock | None) -> None:
+    if clock is not None:
+        seconds = clock.write(run.state())
+        run.stages["checkpoint"] = run.stages.get("checkpoint", 0.0) + seconds

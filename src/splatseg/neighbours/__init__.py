@@ -4,8 +4,8 @@ The native search (``native/neighbours.h``) and its readable twin, `neighbours.r
 compares everything with everything.
 """
 
-from splatseg.neighbours._ball import ball_means as ball_means
 from splatseg.neighbours._index import NeighbourIndex as NeighbourIndex
-from splatseg.neighbours._results import NeighbourLists as NeighbourLists
-from splatseg.neighbours._results import Neighbours as Neighbours
-from splatseg.neighbours._subset import Subset as Subset
+from splatseg.neighbours._index import NeighbourLists as NeighbourLists
+from splatseg.neighbours._index import Neighbours as Neighbours
+from splatseg.neighbours._index import Subset as Subset
+from splatseg.neighbours._index import ball_means as ball_means

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 
-from splatseg.neighbours._results import NeighbourLists, Neighbours, square_root
+from splatseg.neighbours._index import NeighbourLists, Neighbours, square_root
 
 
 def squared_distances(

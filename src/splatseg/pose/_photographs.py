@@ -1,27 +1,27 @@
-"""Photographs made ready: found, turned upright, made smaller, and sorted by lens."""
+"""Photographs made ready: of a folder or a video, turned upright, made smaller, sorted by lens."""
 
+import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import torch
 from jaxtyping import UInt8
+from msgspec import Meta
 from PIL import Image
 from torch import Tensor
 
 from splatseg.core import Camera, View
-from splatseg.core.boundary import boundary
+from splatseg.core.boundary import boundary, convert_fields
+from splatseg.core.options import Count, Natural, options
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.io.atomic import check_utf8
 from splatseg.io.captures import bare_photographs
 from splatseg.io.foreign import reading
 from splatseg.io.images import image_size, load_image, open_image, reduced_size
-from splatseg.pose._exif import LensFacts, lens_facts
-from splatseg.pose._options import PoseOptions
-from splatseg.pose._report import LeftOut
 
 HEIC_SUFFIXES = frozenset({".heic", ".heif", ".hif", ".avif"})
 RAW_SUFFIXES = frozenset({
@@ -37,6 +37,17 @@ HOW_TO_PHOTOGRAPH = (
 )
 # Where EXIF data say nothing: a field of view of 45 degrees, as COLMAP guesses.
 _GUESSED_FOCAL = 1.2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LensFacts:
+    """What EXIF data say of a lens."""
+
+    identity: tuple[str, ...]
+    """Make, model, lens and focal lengths; all empty where there are no such data."""
+
+    focal: float | None
+    """Focal length in pixels of the photograph as it is now; None where the data do not say."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,10 +83,6 @@ class WorkingLens:
     images: dict[str, str]
     """File name of the photograph by file name of the working copy."""
 
-    def as_json(self) -> dict[str, Any]:
-        """For the job of the worker."""
-        return {name: getattr(self, name) for name in self.__slots__}
-
 
 def find_photographs(folder: Path) -> tuple[Path, ...]:
     """Photographs in a folder or its folder ``images``, sorted by name.
@@ -110,6 +117,19 @@ def holds_photographs(folder: Path) -> bool:
     )
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LeftOut:
+    """A photograph without a pose."""
+
+    name: str
+    """Its file name."""
+
+    why: str
+
+    def __post_init__(self) -> None:
+        convert_fields(self)
+
+
 def read_headers(paths: Sequence[Path]) -> tuple[list[Photograph], list[LeftOut]]:
     """Size and lens of each photograph, and those that cannot be read."""
     good: list[Photograph] = []
@@ -124,6 +144,56 @@ def read_headers(paths: Sequence[Path]) -> tuple[list[Photograph], list[LeftOut]
         else:
             good.append(Photograph(path=path, width=width, height=height, facts=facts))
     return good, bad
+
+
+CameraSharing = Literal["auto", "shared", "per-image"]
+"""Which photographs share one lens."""
+
+
+Mapper = Literal["auto", "global", "incremental"]
+"""Who turns matches into cameras."""
+
+
+Matching = Literal["auto", "exhaustive", "retrieval"]
+"""Which pairs of photographs are compared."""
+
+
+@options(
+    removed={
+        "max_features": "the 8192 features of the largest scales are kept",
+        "exhaustive_up_to": "`matching` chooses for any number of photographs",
+        "overlap": "each photograph is compared with the 6 that follow it by name",
+        "neighbours": "each photograph is compared with the 16 that look most like it",
+    }
+)
+class PoseOptions:
+    """How poses are recovered from photographs."""
+
+    longest: Annotated[int, Meta(ge=64)] = 1000
+    """Longest side, in pixels, at which features are found. More sees finer detail, takes
+    longer (with its square) and rarely helps."""
+
+    matching: Matching = "auto"
+    """exhaustive: every photograph with every other. retrieval: with those that follow it by
+    name and those that look most like it. auto: exhaustive up to 60 photographs."""
+
+    mapper: Mapper = "auto"
+    """auto: global, and incremental too where that left photographs out or fits badly; the
+    better model is kept."""
+
+    cameras: CameraSharing = "auto"
+    """auto: photographs of one size with the same make, model and focal length in their EXIF
+    data (or none of these) share a lens. shared: all do. per-image: none do."""
+
+    frames: Annotated[int, Meta(ge=3)] = 120
+    """Frames taken from a video."""
+
+    seed: Natural = 0
+    """Seed of everything that is drawn at random."""
+
+    threads: Count | None = None
+    """Threads; None is OMP_NUM_THREADS, else all cores. Only on one thread is the result the
+    same to the bit in every run."""
 
 
 def write_working_copies(
@@ -280,3 +350,76 @@ def _refuse_undecodable(folder: Path, found: Sequence[Path]) -> None:
 
 def _reason(error: FileFormatError, path: Path) -> str:
     return str(error).removeprefix(f"{path}: ").rstrip(".")
+
+
+# What the EXIF data of a photograph say about its lens.
+#
+# With the focal length in terms of 35 mm film :math:`f_{35}`, whose frame has a diagonal of
+# :math:`\sqrt{36^2 + 24^2} = 43.27` mm, the focal length in pixels is
+#
+# .. math:: f = f_{35} \, \frac{\sqrt{w^2 + h^2}}{43.27}.
+#
+# Else it is the focal length in millimetres times the pixels of the sensor for a millimetre
+# (tag FocalPlaneXResolution), scaled by how much smaller the photograph was made since.
+#
+# References: CIPA DC-008 (Exif 2.32), tags FocalLengthIn35mmFilm and FocalPlaneXResolution.
+
+
+_MAKE, _MODEL, _EXIF_IFD = 0x010F, 0x0110, 0x8769
+_FOCAL, _FOCAL_35, _LENS_MODEL = 0x920A, 0xA405, 0xA434
+_WIDTH, _HEIGHT = 0xA002, 0xA003
+_PLANE_X, _PLANE_UNIT = 0xA20E, 0xA210
+_MILLIMETRES = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+_DIAGONAL_35 = math.hypot(36.0, 24.0)
+# Fields of view from 6 to 118 degrees; anything else is a tag that was filled with nonsense.
+_PLAUSIBLE = (0.3, 10.0)
+_SAME_SHAPE = 0.02
+
+
+def lens_facts(image: Image.Image) -> LensFacts:
+    """What the EXIF data of an opened image say of its lens."""
+    if image.format == "PNG" and "exif" not in image.info:
+        # Pillow would decode the whole image to look for them behind the pixels.
+        return LensFacts(identity=("",) * 5, focal=None)
+    exif = image.getexif()
+    detail: Mapping[int, Any] = exif.get_ifd(_EXIF_IFD)
+    identity = tuple(
+        str(tags.get(tag, "")).strip("\0 ")
+        for tags, tag in (
+            (exif, _MAKE),
+            (exif, _MODEL),
+            (detail, _LENS_MODEL),
+            (detail, _FOCAL),
+            (detail, _FOCAL_35),
+        )
+    )
+    return LensFacts(identity=identity, focal=_focal(detail, *image.size))
+
+
+def _focal(detail: Mapping[int, Any], width: int, height: int) -> float | None:
+    taken = (_number(detail, _WIDTH), _number(detail, _HEIGHT))
+    if taken[0] and taken[1]:
+        # Either may have been turned; the shape of an uncropped image is the same.
+        now, then = max(width, height) / min(width, height), max(taken) / min(taken)
+        if abs(now - then) > _SAME_SHAPE * then:
+            return None
+    focal = 0.0
+    if film := _number(detail, _FOCAL_35):
+        focal = film * math.hypot(width, height) / _DIAGONAL_35
+    elif taken[0] and taken[1]:
+        millimetre = _MILLIMETRES.get(int(_number(detail, _PLANE_UNIT) or 2), 0.0)
+        density = _number(detail, _PLANE_X)
+        if millimetre:
+            scale = max(width, height) / max(taken)
+            focal = _number(detail, _FOCAL) * density / millimetre * scale
+    low, high = (factor * max(width, height) for factor in _PLAUSIBLE)
+    return focal if low <= focal <= high else None
+
+
+def _number(tags: Mapping[int, Any], tag: int) -> float:
+    """A number of EXIF data; 0 where it lacks or is none, as cameras write for "unknown"."""
+    try:
+        value = float(tags.get(tag, 0))
+    except (TypeError, ValueError, ZeroDivisionError):
+        return 0.0
+    return value if math.isfinite(value) and value > 0 else 0.0

@@ -1,37 +1,146 @@
 """Photographs or a video in, a capture with cameras and start points out."""
 
+import importlib.util
+import json
+import os
 import shutil
+import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
+import splatseg
 from splatseg.core import Capture
 from splatseg.core.boundary import boundary
-from splatseg.errors import InputError
-from splatseg.pose._options import PoseOptions
+from splatseg.errors import (
+    BackendError,
+    FileFormatError,
+    InputError,
+    MissingPackageError,
+)
+from splatseg.io.json_files import parse_object, read_json
+from splatseg.io.schema import structured
 from splatseg.pose._photographs import (
     HOW_TO_PHOTOGRAPH,
     MIN_PHOTOGRAPHS,
+    LeftOut,
+    PoseOptions,
     WorkingLens,
     find_photographs,
     read_headers,
     write_working_copies,
 )
-from splatseg.pose._process import require_pycolmap, run_worker, usable_threads
-from splatseg.pose._report import LeftOut, Lens, MapperTry, PoseReport
 from splatseg.pose._saved import (
     FILE,
     MODEL,
+    Lens,
+    MapperTry,
+    PoseReport,
     fingerprint,
     load_capture,
     load_pose_report,
     save_poses,
 )
 from splatseg.pose._video import check_video, is_video, take_frames
+
+_LOG_LINES = 3
+
+
+def require_pycolmap() -> None:
+    """Raise `MissingPackageError` where pycolmap is not installed; it is not imported here."""
+    if importlib.util.find_spec("pycolmap") is None:
+        raise MissingPackageError(
+            "poses from bare photographs need a package that is not installed (pycolmap); try: "
+            "pip install 'splatseg[sfm]'."
+        )
+
+
+def usable_threads(asked: int | None) -> int:
+    """Threads to work with: what was asked for, OMP_NUM_THREADS, or the cores we may use."""
+    if asked is not None:
+        return asked
+    setting = os.environ.get("OMP_NUM_THREADS", "")
+    if setting.isdigit() and int(setting) > 0:
+        return int(setting)
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def run_worker(
+    job: Mapping[str, Any], folder: Path, *, progress: Callable[[str, int, int], None]
+) -> dict[str, Any]:
+    """Do a job in a process of its own, and give its result.
+
+    Args:
+        job: See `splatseg.pose._worker`.
+        folder: Where job, log and result lie.
+        progress: Told the stage, what is done of it, and how much there is (0: not known).
+
+    Raises:
+        BackendError: If the process ended without a result.
+    """
+    result = Path(job["result"])
+    result.unlink(missing_ok=True)
+    (folder / "job.json").write_text(json.dumps(job, indent=1), encoding="utf-8")
+    log = folder / "log.txt"
+    with log.open("w", encoding="utf-8") as errors:
+        # A session of its own: Ctrl-C reaches this process, which ends that one. Should this
+        # one be killed, its end of the pipe closes, and that one ends itself.
+        process = subprocess.Popen(  # noqa: S603  (our own module, no shell)
+            [sys.executable, "-P", "-m", "splatseg.pose._worker", str(folder / "job.json")],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=errors,
+            env=_environment(cast(int, job["options"]["threads"])),
+            start_new_session=True,
+            text=True,
+            encoding="utf-8",
+        )
+        try:
+            for line in process.stdout or ():
+                _pass_on(line, progress)
+            status = process.wait()
+        finally:
+            if process.poll() is None:
+                process.kill()
+            process.wait()
+            for pipe in (process.stdin, process.stdout):
+                if pipe is not None:
+                    pipe.close()
+    if status != 0 or not result.is_file():
+        raise BackendError(_failure(status, log))
+    return read_json(result)
+
+
+def _environment(threads: int) -> dict[str, str]:
+    """Ours, with this very package first on the path and as many threads as were asked for."""
+    home = str(Path(splatseg.__file__).parent.parent)
+    path = os.pathsep.join(filter(None, (home, os.environ.get("PYTHONPATH", ""))))
+    return {**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": str(threads)}
+
+
+def _pass_on(line: str, progress: Callable[[str, int, int], None]) -> None:
+    try:
+        message = parse_object(line, where="progress")
+        stage, done, total = message["stage"], message["done"], message["total"]
+    except (FileFormatError, KeyError):
+        return  # Something that a library printed.
+    progress(str(stage), int(done), int(total))
+
+
+def _failure(status: int, log: Path) -> str:
+    lines = [
+        line for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line
+    ]
+    last = "; ".join(lines[-_LOG_LINES:]) or "it said nothing"
+    return f"structure from motion ended with status {status}: {last} (all of it is in {log})."
+
 
 _FEW_FEATURES = 100
 
@@ -98,10 +207,10 @@ def recover_poses(
     """
     source = Path(photographs)
     require_pycolmap()
-    tell = _teller(progress)
+    tell = teller(progress)
     if folder is None and is_video(source):
         raise InputError("folder: expected a folder for the frames of the video, got None.")
-    with _given_or_temporary(folder) as kept:
+    with given_or_temporary(folder) as kept:
         if is_video(source):
             root, files = kept, _frames(source, kept, options, tell)
         else:
@@ -122,13 +231,19 @@ def recover_poses(
 
 
 @contextmanager
-def _given_or_temporary(folder: Path | str | None) -> Generator[Path]:
-    """The folder; where there is none, one that is deleted afterwards."""
-    if folder is not None:
-        yield Path(folder)
+def given_or_temporary(folder: Path | str | None) -> Generator[Path]:
+    """The folder, removed again if it is left empty; for None one that is deleted afterwards."""
+    if folder is None:
+        with tempfile.TemporaryDirectory(prefix="splatseg-") as temporary:
+            yield Path(temporary)
         return
-    with tempfile.TemporaryDirectory(prefix="splatseg-") as temporary:
-        yield Path(temporary)
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        yield folder
+    finally:
+        with suppress(OSError):  # it is not empty
+            folder.rmdir()
 
 
 def _recover(
@@ -171,7 +286,7 @@ def _recover(
             f"{source}: expected photographs of one scene of which at least {MIN_PHOTOGRAPHS} "
             f"can be placed, got {placed} of {len(files)}; {HOW_TO_PHOTOGRAPH}."
         )
-    capture = load_capture(work / "model", files, root=_root_of(files))
+    capture = load_capture(work / "model", files, root=files[0].parent)
     report = _report(
         result,
         lenses,
@@ -195,22 +310,14 @@ def _worker_job(
         "images": str(work / "images"),
         "folder": str(work),
         "result": str(work / "result.json"),
-        "lenses": [lens.as_json() for lens in lenses],
+        "lenses": [asdict(lens) for lens in lenses],
         "options": {
-            "max_features": options.max_features,
             "matching": options.matching,
-            "exhaustive_up_to": options.exhaustive_up_to,
-            "overlap": options.overlap,
-            "neighbours": options.neighbours,
             "mapper": options.mapper,
             "seed": options.seed,
             "threads": threads,
         },
     }
-
-
-def _root_of(files: Sequence[Path]) -> Path:
-    return files[0].parent
 
 
 def _work_folder(folder: Path, made_of: str) -> Path:
@@ -287,7 +394,7 @@ def _report(
         registered=tuple(sorted(own_name[copy] for copy in registered)),
         left_out=tuple(sorted([*unusable, *left_out], key=lambda left: left.name)),
         mapper=result["tries"][result["best"]]["mapper"],
-        tries=tuple(MapperTry.from_json(attempt) for attempt in result["tries"]),
+        tries=tuple(structured(attempt, MapperTry, where="result") for attempt in result["tries"]),
         error=result["model"]["error"],
         longest=longest,
         points=result["model"]["points"],
@@ -322,7 +429,9 @@ def _why(copy: str, facts: Mapping[str, int] | None, members: Sequence[Sequence[
     )
 
 
-def _teller(progress: Callable[[PoseProgress], None] | None) -> Callable[[str, int, int], None]:
+def teller(progress: Callable[[PoseProgress], None] | None) -> Callable[[str, int, int], None]:
+    """Progress as stage, done and total; None is told nothing."""
+
     def tell(stage: str, done: int, total: int) -> None:
         if progress is not None:
             progress(PoseProgress(stage=stage, done=done, total=total))

@@ -1,6 +1,6 @@
 """The process that works with pycolmap: features, matches, mapping, and what came of it.
 
-Run as ``python -m splatseg.pose._worker JOB.json`` by `splatseg.pose._process`. It is a process
+Run as ``python -m splatseg.pose._worker JOB.json`` by `splatseg.pose._recover`. It is a process
 of its own because calls into pycolmap cannot be interrupted, and because pycolmap and Pillow
 cannot live in one process: each brings its own copy of the image libraries, and a PNG saved
 after ``import pycolmap`` ends in heap corruption (seen with pycolmap 4.2.1 and Pillow 12).
@@ -16,14 +16,15 @@ import shutil
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pycolmap
 
-from splatseg.pose._model import Model, finish_model, model_facts
 from splatseg.pose._pairs import (
     all_pairs,
     chosen_pairs,
@@ -32,6 +33,11 @@ from splatseg.pose._pairs import (
     linking_pairs,
 )
 
+# Features of a photograph, those of the largest scales.
+_MAX_FEATURES = 8192
+# Photographs up to which "auto" compares every pair; else each with so many that follow it by
+# name, and so many that look most like it.
+_EXHAUSTIVE_UP_TO, _OVERLAP, _NEIGHBOURS = 60, 6, 16
 _IMAGES_AT_ONCE = 8
 _PAIRS_AT_ONCE = 256
 # Photographs with fewer verified matches in all are looked at again, at seconds a pair.
@@ -51,7 +57,7 @@ def main() -> int:
     # Warnings of COLMAP go to the standard error stream, which the parent keeps in a file.
     pycolmap.logging.minloglevel = 1
     job = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
-    result = Job(job).run()
+    result = WorkerJob(job).run()
     out = Path(job["result"])
     temporary = out.with_suffix(".tmp")
     temporary.write_text(json.dumps(result), encoding="utf-8")
@@ -59,7 +65,48 @@ def main() -> int:
     return 0
 
 
-class Job:
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FoundModel:
+    """What one mapper made: its largest model, and the smaller ones."""
+
+    mapper: str
+    reconstructions: tuple[Any, ...]
+    """The largest first."""
+
+    registered: int
+    error: float
+    """Mean reprojection error of the largest, pixels of the working copies."""
+
+    seconds: float
+
+    @staticmethod
+    def of(mapper: str, found: Sequence[Any], seconds: float) -> "FoundModel":
+        """The result of a mapper, without photographs that see too few points."""
+        for reconstruction in found:
+            _drop_doubtful(reconstruction)
+        kept = [r for r in found if r.num_reg_images() >= 2 and r.num_points3D() > 0]
+        kept.sort(key=lambda r: (-r.num_reg_images(), r.compute_mean_reprojection_error()))
+        return FoundModel(
+            mapper=mapper,
+            reconstructions=tuple(kept),
+            registered=int(kept[0].num_reg_images()) if kept else 0,
+            error=float(kept[0].compute_mean_reprojection_error()) if kept else 0.0,
+            seconds=seconds,
+        )
+
+    def facts(self) -> dict[str, Any]:
+        """In values that JSON holds."""
+        return {
+            "mapper": self.mapper,
+            "registered": self.registered,
+            "error": self.error,
+            "points": int(self.reconstructions[0].num_points3D()) if self.registered else 0,
+            "models": [int(r.num_reg_images()) for r in self.reconstructions],
+            "seconds": self.seconds,
+        }
+
+
+class WorkerJob:
     """One set of photographs."""
 
     def __init__(self, job: dict[str, Any]) -> None:
@@ -103,7 +150,7 @@ class Job:
         options = pycolmap.FeatureExtractionOptions()
         options.num_threads = self._options["threads"]
         options.use_gpu = False
-        options.sift.max_num_features = self._options["max_features"]
+        options.sift.max_num_features = _MAX_FEATURES
         done = 0
         for lens, id in zip(self._lenses, ids, strict=True):
             reader = pycolmap.ImageReaderOptions(
@@ -124,23 +171,20 @@ class Job:
 
     def _write_lenses(self) -> list[int]:
         """Ids of the lenses in the database, which gets them in the first run."""
-        database = pycolmap.Database.open(self._database)
-        try:
+        with closing(pycolmap.Database.open(self._database)) as database:
             there = sorted(camera.camera_id for camera in database.read_all_cameras())
             if len(there) == len(self._lenses):
                 return there
             # New, or stopped while they were written: no feature was found before they were.
             database.clear_all_tables()
             return [database.write_camera(_camera(lens)) for lens in self._lenses]
-        finally:
-            database.close()
 
     # -- matches ----------------------------------------------------------------------------
 
     def _match(self) -> None:
         count = len(self._names)
         exhaustive = self._options["matching"] == "exhaustive" or (
-            self._options["matching"] == "auto" and count <= self._options["exhaustive_up_to"]
+            self._options["matching"] == "auto" and count <= _EXHAUSTIVE_UP_TO
         )
         if exhaustive:
             self._match_pairs(all_pairs(count))
@@ -151,11 +195,10 @@ class Job:
     def _match_likely(self, count: int) -> None:
         """Pairs by name and by looks, and then what may join parts that do not hang together."""
         alike = likeness(self._descriptors(), seed=self._options["seed"])
-        near = self._options["neighbours"]
-        self._match_pairs(chosen_pairs(alike, overlap=self._options["overlap"], neighbours=near))
+        self._match_pairs(chosen_pairs(alike, overlap=_OVERLAP, neighbours=_NEIGHBOURS))
         groups = connected_groups(count, list(self._verified()))
         if len(set(groups)) > 1:
-            self._match_pairs(linking_pairs(alike, groups, neighbours=near))
+            self._match_pairs(linking_pairs(alike, groups, neighbours=_NEIGHBOURS))
 
     def _look_again(self) -> None:
         """Search along epipolar lines where a photograph hardly hangs on the rest.
@@ -170,15 +213,12 @@ class Job:
                 strength[i] += inliers
         weak = [pair for pair in verified if min(strength[i] for i in pair) < _WEAK]
         weak = sorted(sorted(weak, key=lambda pair: -verified[pair])[:_MAX_GUIDED_PAIRS])
-        database = pycolmap.Database.open(self._database)
-        try:
+        with closing(pycolmap.Database.open(self._database)) as database:
             ids = {image.name: image.image_id for image in database.read_all_images()}
             for pair in weak:
                 a, b = (ids[self._names[i]] for i in pair)
                 database.delete_matches(a, b)
                 database.delete_two_view_geometry(a, b)
-        finally:
-            database.close()
         # Should this be stopped now, the next run finds them missing and matches them anew.
         self._match_pairs(weak, guided=True)
 
@@ -207,22 +247,16 @@ class Job:
             _tell("matches", done, len(pairs))
 
     def _descriptors(self) -> list[np.ndarray[Any, np.dtype[np.uint8]]]:
-        database = pycolmap.Database.open(self._database)
-        try:
+        with closing(pycolmap.Database.open(self._database)) as database:
             ids = {image.name: image.image_id for image in database.read_all_images()}
             return [np.asarray(database.read_descriptors(ids[n]).data) for n in self._names]
-        finally:
-            database.close()
 
     def _verified(self) -> dict[tuple[int, int], int]:
         """How many matches say that two photographs show the same, by their places."""
-        database = pycolmap.Database.open(self._database)
-        try:
+        with closing(pycolmap.Database.open(self._database)) as database:
             index_of = {name: i for i, name in enumerate(self._names)}
             index_of_id = {i.image_id: index_of[i.name] for i in database.read_all_images()}
             pair_ids, inliers = database.read_two_view_geometry_num_inliers()
-        finally:
-            database.close()
         verified: dict[tuple[int, int], int] = {}
         for pair_id, count in zip(pair_ids, inliers, strict=True):
             a, b = (index_of_id[id] for id in pycolmap.pair_id_to_image_pair(pair_id))
@@ -232,13 +266,13 @@ class Job:
 
     # -- mapping ----------------------------------------------------------------------------
 
-    def _map(self) -> tuple[list[Model], Model | None]:
+    def _map(self) -> tuple[list[FoundModel], FoundModel | None]:
         """Every try, and the one with the most photographs and then the least error."""
         plain = self._copied("plain")
         guessed = any(not lens["prior"] for lens in self._lenses)
         database = self._calibrated() if guessed else plain
         mapper = self._options["mapper"]
-        tries: list[Model] = []
+        tries: list[FoundModel] = []
         if mapper in ("auto", "global"):
             tries.append(self._global(database))
         if mapper == "incremental" or (mapper == "auto" and not self._good(tries)):
@@ -250,7 +284,7 @@ class Job:
         best = min(found, key=lambda a: (-a.registered, a.error), default=None)
         return tries, best
 
-    def _good(self, tries: Sequence[Model]) -> bool:
+    def _good(self, tries: Sequence[FoundModel]) -> bool:
         return any(a.registered == len(self._names) and a.error <= _GOOD_ERROR for a in tries)
 
     def _copied(self, name: str) -> Path:
@@ -272,16 +306,16 @@ class Job:
         pycolmap.calibrate_view_graph(database, options)
         return database
 
-    def _global(self, database: Path) -> Model:
+    def _global(self, database: Path) -> FoundModel:
         options = pycolmap.GlobalPipelineOptions()
         options.num_threads = self._options["threads"]
         options.random_seed = self._options["seed"]
         begin = time.monotonic()
         _tell("global mapper", 0, 0)
         found = pycolmap.global_mapping(database, self._images, self._empty("global"), options)
-        return Model.of("global", list(found.values()), time.monotonic() - begin)
+        return FoundModel.of("global", list(found.values()), time.monotonic() - begin)
 
-    def _incremental(self, database: Path, name: str) -> Model:
+    def _incremental(self, database: Path, name: str) -> FoundModel:
         options = pycolmap.IncrementalPipelineOptions()
         options.num_threads = self._options["threads"]
         options.random_seed = self._options["seed"]
@@ -301,7 +335,7 @@ class Job:
             options,
             next_image_callback=next_image,
         )
-        return Model.of(name, list(found.values()), time.monotonic() - begin)
+        return FoundModel.of(name, list(found.values()), time.monotonic() - begin)
 
     def _empty(self, name: str) -> Path:
         folder = self._folder / name
@@ -311,7 +345,7 @@ class Job:
 
     # -- what came of it --------------------------------------------------------------------
 
-    def _finish(self, best: Model) -> dict[str, Any]:
+    def _finish(self, best: FoundModel) -> dict[str, Any]:
         reconstruction = best.reconstructions[0]
         facts = model_facts(reconstruction)
         facts["without_distortion"] = finish_model(
@@ -324,8 +358,7 @@ class Job:
     def _photographs(self) -> dict[str, dict[str, int]]:
         """Features and verified pairs of every photograph."""
         pairs = self._verified()
-        database = pycolmap.Database.open(self._database)
-        try:
+        with closing(pycolmap.Database.open(self._database)) as database:
             return {
                 image.name: {
                     "features": int(database.num_keypoints_for_image(image.image_id)),
@@ -336,11 +369,9 @@ class Job:
                 }
                 for image in database.read_all_images()
             }
-        finally:
-            database.close()
 
 
-def _members(best: Model) -> list[list[str]]:
+def _members(best: FoundModel) -> list[list[str]]:
     """Names of the photographs of each model of a try, the largest first."""
     return [
         sorted(model.image(id).name for id in model.reg_image_ids())
@@ -375,6 +406,98 @@ def _end_with_parent() -> None:
         os._exit(1)
 
     threading.Thread(target=wait, daemon=True).start()
+
+
+# A reconstruction of pycolmap: judged, freed of what is doubtful, and scaled to photographs.
+
+
+# A photograph that sees fewer of the points than this has no pose worth keeping.
+_MIN_POINTS = 12
+# Where the lens model folds over within this factor of the corner, it is given up.
+_FOLD_MARGIN = 1.1
+# Extent of the cameras (10th to 90th percentile) in the world that is written.
+_EXTENT = 10.0
+
+
+def model_facts(reconstruction: Any) -> dict[str, Any]:
+    """Points, errors and lenses, before the model is scaled to the photographs."""
+    return {
+        "points": int(reconstruction.num_points3D()),
+        "error": float(reconstruction.compute_mean_reprojection_error()),
+        "track_length": float(reconstruction.compute_mean_track_length()),
+    }
+
+
+def finish_model(
+    reconstruction: Any, lenses: Sequence[Mapping[str, Any]], *, threads: int
+) -> list[int]:
+    """Scale a model to the photographs' own pixels and names, and the world to a usual size.
+
+    Each axis is scaled by its own ratio, which makes OPENCV of SIMPLE_RADIAL. Pixel centres are
+    at halves in COLMAP as in splatseg, so nothing is shifted.
+
+    Returns:
+        Indices, in `lenses`, of those whose distortion was given up since it folded over.
+    """
+    of_image = {name: i for i, lens in enumerate(lenses) for name in lens["images"]}
+    ids = list(reconstruction.reg_image_ids())
+    lens_of = {
+        reconstruction.image(id).camera_id: of_image[reconstruction.image(id).name] for id in ids
+    }
+    without_distortion = [id for id in lens_of if _folds(reconstruction.camera(id))]
+    if without_distortion:
+        _remove_distortion(reconstruction, without_distortion, threads)
+    reconstruction.normalize(extent=_EXTENT)
+    for id in ids:
+        image = reconstruction.image(id)
+        lens = lenses[of_image[image.name]]
+        scale = np.array([lens["full_width"] / lens["width"], lens["full_height"] / lens["height"]])
+        for point in image.points2D:
+            point.xy = point.xy * scale
+        image.name = lens["images"][image.name]
+    for camera_id, index in lens_of.items():
+        _scale_camera(reconstruction.camera(camera_id), lenses[index])
+    return sorted(lens_of[id] for id in without_distortion)
+
+
+def _drop_doubtful(reconstruction: Any) -> None:
+    """Take out photographs that see too few points."""
+    for id in list(reconstruction.reg_image_ids()):
+        image = reconstruction.image(id)
+        if image.num_points3D < _MIN_POINTS:
+            reconstruction.deregister_frame(image.frame_id)
+
+
+def _scale_camera(camera: Any, lens: Mapping[str, Any]) -> None:
+    focal, cx, cy, k1 = (float(v) for v in camera.params)
+    sx = lens["full_width"] / lens["width"]
+    sy = lens["full_height"] / lens["height"]
+    camera.model = pycolmap.CameraModelId.OPENCV
+    camera.width, camera.height = lens["full_width"], lens["full_height"]
+    camera.params = [focal * sx, focal * sy, cx * sx, cy * sy, k1, 0.0, 0.0, 0.0]
+
+
+def _folds(camera: Any) -> bool:
+    r"""Whether r (1 + k r^2) has its maximum inside the image, so that it has no inverse.
+
+    The maximum lies at r = 1 / sqrt(-3 k) and is 2/3 of that.
+    """
+    focal, cx, cy, k1 = (float(v) for v in camera.params)
+    if k1 >= 0:
+        return False
+    corner = np.hypot(max(cx, camera.width - cx), max(cy, camera.height - cy)) / focal
+    return bool(2.0 / 3.0 / np.sqrt(-3.0 * k1) < _FOLD_MARGIN * corner)
+
+
+def _remove_distortion(reconstruction: Any, camera_ids: Sequence[int], threads: int) -> None:
+    """Give up the distortion of lenses and fit everything else to that."""
+    for id in camera_ids:
+        camera = reconstruction.camera(id)
+        camera.params = [*(float(v) for v in camera.params[:3]), 0.0]
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_extra_params = False
+    options.ceres.solver_options.num_threads = threads
+    pycolmap.bundle_adjustment(reconstruction, options)
 
 
 if __name__ == "__main__":

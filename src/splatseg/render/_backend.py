@@ -9,27 +9,31 @@ and `weights` keeps W.
 """
 
 from abc import ABC, abstractmethod
-from typing import ClassVar, Literal, Self
+from functools import cache
+from typing import ClassVar, Literal, Self, cast, get_args
+from weakref import WeakKeyDictionary
 
 import torch
 from jaxtyping import Float, Int, Int64
 from torch import Tensor
 
+from splatseg._check import check_choice, check_finite, check_shape
 from splatseg.core import Camera, Gaussians
-from splatseg.render._options import RenderOptions
+from splatseg.core.boundary import boundary
+from splatseg.core.gaussians import LOW_PASS
+from splatseg.errors import InputError, RangeError
+from splatseg.render._products import ImageWeights
 from splatseg.render._rows import SparseWeights
 from splatseg.render._values import (
     BackProjected,
     Contributors,
     Rendered,
+    RenderOptions,
     SparseBackProjected,
     SparseImage,
     SparseSignal,
     StrongestChannels,
 )
-from splatseg.render._view_weights import ImageWeights, ViewWeights
-
-Layout = Literal["csr", "blocks"]
 
 _CHANNELS = 64
 """Channels of a sparse image or signal made dense at a time, where there is no sparse kernel."""
@@ -169,45 +173,6 @@ class Backend(ABC):
         with self.prepare(gaussians, camera, options=options) as view:
             return view.render(signal, screen_offsets=screen_offsets)
 
-    def back_project(
-        self,
-        gaussians: Gaussians,
-        camera: Camera,
-        image: Float[Tensor, "height width channels"],
-        *,
-        options: RenderOptions,
-    ) -> BackProjected:
-        """`BackendView.back_project` of a view that is used once."""
-        with self.prepare(gaussians, camera, options=options) as view:
-            return view.back_project(image)
-
-    def contributors(
-        self,
-        gaussians: Gaussians,
-        camera: Camera,
-        pixels: Int[Tensor, "p 2"],
-        k: int,
-        *,
-        options: RenderOptions,
-    ) -> Contributors:
-        """`BackendView.contributors` of a view that is used once."""
-        with self.prepare(gaussians, camera, options=options) as view:
-            return view.contributors(pixels, k)
-
-    def weights(
-        self,
-        gaussians: Gaussians,
-        camera: Camera,
-        pixels: Int[Tensor, "p 2"] | None,
-        k: int | None,
-        *,
-        layout: Layout,
-        options: RenderOptions,
-    ) -> ViewWeights:
-        """`BackendView.rows` or `blocks` of a view that is used once."""
-        with self.prepare(gaussians, camera, options=options) as view:
-            return view.rows(pixels, k) if layout == "csr" else view.blocks()
-
 
 def needs_graph(gaussians: Gaussians, camera: Camera, *others: Tensor | None) -> bool:
     """Whether a render must be part of a graph of autograd."""
@@ -221,3 +186,164 @@ def needs_graph(gaussians: Gaussians, camera: Camera, *others: Tensor | None) ->
         *others,
     )
     return torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in leaves)
+
+
+BackendName = Literal["auto", "cpu", "cuda", "reference"]
+
+
+@boundary
+def get_backend(name: str = "auto", *, like: Tensor | None = None) -> Backend:
+    """The backend of this name.
+
+    ``auto`` is ``cuda`` for tensors on a CUDA device and ``cpu`` for all others: it follows the
+    data and never falls back.
+
+    Args:
+        name: ``auto``, ``cpu``, ``cuda`` or ``reference``.
+        like: A tensor of the scene; ``auto`` asks where it is.
+
+    Raises:
+        InputError: If there is no backend of this name.
+        MissingPackageError: If ``cuda`` is asked for without gsplat or without a GPU.
+    """
+    check_choice("backend", name, get_args(BackendName))
+    if name == "auto":
+        name = "cuda" if like is not None and like.device.type == "cuda" else "cpu"
+    return _backend(cast(BackendName, name))
+
+
+@boundary
+def options_for(gaussians: Gaussians, backend: str = "auto") -> RenderOptions:
+    """The default options for Gaussians.
+
+    The `default_options` of the backend, with the low-pass filter that they were fitted with.
+    """
+    return default_options(
+        backend,
+        like=gaussians.means,
+        antialiased=gaussians.antialiased,
+        low_pass=gaussians.low_pass,
+    )
+
+
+@boundary
+def default_options(
+    name: str = "auto",
+    *,
+    like: Tensor | None = None,
+    sh_degree: int | None = None,
+    antialiased: bool = False,
+    low_pass: float = LOW_PASS,
+) -> RenderOptions:
+    """The default options of a backend.
+
+    The defaults of `RenderOptions`, but for the opacity cap of ``cuda``, which gsplat has built
+    in (``docs/decisions/0006-cuda-opacity-cap.md``).
+
+    Args:
+        name: As for `get_backend`.
+        like: As for `get_backend`.
+        sh_degree: Maximum degree of the spherical harmonics in use; None is all.
+        antialiased: What the Gaussians are meant for, `Gaussians.antialiased`.
+        low_pass: Likewise, `Gaussians.low_pass`.
+    """
+    changes: dict[str, float] = {}
+    if get_backend(name, like=like).name == "cuda":
+        from splatseg.render.cuda import GSPLAT_ALPHA_MAX
+
+        changes = {"alpha_max": GSPLAT_ALPHA_MAX}
+    return RenderOptions(sh_degree=sh_degree, antialiased=antialiased, low_pass=low_pass, **changes)
+
+
+@cache
+def _backend(name: BackendName) -> Backend:
+    if name == "cuda":
+        from splatseg.render.cuda import CudaBackend
+
+        return CudaBackend()
+    if name == "reference":
+        from splatseg.render.reference import ReferenceBackend
+
+        return ReferenceBackend()
+    from splatseg.render.cpu import CpuBackend
+
+    return CpuBackend()
+
+
+MAX_CHANNELS = 1024
+_checked: "WeakKeyDictionary[Gaussians, tuple[int, ...]]" = WeakKeyDictionary()
+
+
+_NARROW = 256
+"""Contributors that may always be asked for, however few Gaussians there are."""
+
+_ENTRIES = 1 << 28
+"""Pixels x contributors at most, of 24 bytes each while they are sorted."""
+
+
+def check_scene(gaussians: Gaussians) -> None:
+    """Scan the values once; again only after somebody wrote into the tensors."""
+    columns = (
+        gaussians.means,
+        gaussians.rotations,
+        gaussians.scales,
+        gaussians.opacities,
+        gaussians.sh,
+    )
+    versions = tuple(-1 if t.is_inference() else t._version for t in columns)  # pyright: ignore[reportPrivateUsage]
+    if -1 in versions or _checked.get(gaussians) != versions:
+        gaussians.check_values()
+        _checked[gaussians] = versions
+
+
+def check_columns(name: str, tensor: Tensor, shape: tuple[int | None, ...]) -> None:
+    """A signal or an image: shape, number of channels, type and values."""
+    check_shape(name, tensor, shape)
+    if not 1 <= tensor.shape[-1] <= MAX_CHANNELS:
+        raise RangeError(f"{name}: expected 1 to {MAX_CHANNELS} channels, got {tensor.shape[-1]}.")
+    if not tensor.is_floating_point():
+        raise InputError(f"{name}: expected floating-point values, got {tensor.dtype}.")
+    check_finite(name, tensor)
+
+
+def check_pixels(pixels: Tensor, camera: Camera) -> None:
+    """Pixels as integers (column, row) inside the image."""
+    check_shape("pixels", pixels, (None, 2))
+    if pixels.is_floating_point() or pixels.dtype == torch.bool:
+        raise InputError(f"pixels: expected integers (column, row), got {pixels.dtype}.")
+    size = torch.tensor([camera.width, camera.height], device=pixels.device)
+    outside = ((pixels < 0) | (pixels >= size)).any(dim=1)
+    if bool(outside.any()):
+        first = pixels[outside][0].tolist()
+        raise RangeError(
+            f"pixels: expected columns in [0, {camera.width}) and rows in "
+            f"[0, {camera.height}), got {first}."
+        )
+
+
+def check_k(k: int) -> None:
+    """At least one contributor a pixel."""
+    if k < 1:
+        raise RangeError(f"k: expected at least 1, got {k}.")
+
+
+def check_table(k: int, *, pixels: int, gaussians: int) -> None:
+    """Contributors are a table of k columns: no wider than there is use for, and of bounded size.
+
+    Args:
+        k: Contributors of a pixel, those that are missing included.
+        pixels: How many pixels.
+        gaussians: How many Gaussians the scene has.
+    """
+    check_k(k)
+    most = max(gaussians, _NARROW)
+    if k > most:
+        raise RangeError(
+            f"k: expected at most {most}, the larger of the scene's {gaussians} Gaussians and "
+            f"{_NARROW}, got {k}."
+        )
+    if pixels * k > _ENTRIES:
+        raise RangeError(
+            f"k: expected at most {_ENTRIES} pixels x k, which take about 6 GB, got "
+            f"{pixels} x {k}; ask for fewer pixels at a time."
+        )

@@ -11,8 +11,7 @@ from torch import Tensor
 from splatseg._check import check_finite, check_shape
 from splatseg.core.boundary import convert_fields
 from splatseg.errors import InputError, RangeError
-from splatseg.render._products import Csr, LinearMap, on_cpu, starts_of, strong_entries
-from splatseg.render._view_weights import ViewWeights
+from splatseg.render._products import Csr, LinearMap, ViewWeights, on_cpu, starts_of, strong_entries
 
 
 @final

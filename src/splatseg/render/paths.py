@@ -17,19 +17,17 @@ References:
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 from splatseg._check import check_shape
 from splatseg.core import Camera, View
 from splatseg.core.rigid import quaternion_from_rotation, rotation_from_quaternion
 from splatseg.errors import InputError, RangeError
-from splatseg.render._path_keys import key_poses
-from splatseg.render._path_poses import Poses, radian_length
-from splatseg.render._path_spline import poses_along_spline
 
 # Length of the mean of the viewing directions, 1 where all are the same.
 _MIN_MEAN_LENGTH = 0.95
@@ -210,3 +208,237 @@ def _pose(rotation: Float[Tensor, "3 3"], centre: Float[Tensor, "3"]) -> Float[T
 
 def _camera(typical: Camera, pose: Float[Tensor, "4 4"]) -> Camera:
     return replace(typical, cam_from_world=pose)
+
+
+# Control poses of a camera path: farthest-point samples of the captured poses in a short tour.
+
+
+_MAX_KEYS = 30
+# Rounds of averaging each key's orientation with its neighbours: hand-held cameras turn far more
+# than a film should.
+_SMOOTHING_ROUNDS = 6
+# A closed tour is taken if it is at most this many times as long as an open one.
+_MAX_CLOSED_RATIO = 1.35
+# Cost of the distance from the captured positions, relative to the length of the path.
+_DETOUR_WEIGHT = 4.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Poses:
+    """Positions and orientations, world from camera."""
+
+    centres: Float[Tensor, "n 3"]
+    quaternions: Float[Tensor, "n 4"]
+
+    def __len__(self) -> int:
+        return len(self.centres)
+
+    def __getitem__(self, index: Tensor) -> "Poses":
+        return Poses(centres=self.centres[index], quaternions=self.quaternions[index])
+
+
+def key_poses(captured: Poses) -> tuple[Poses, bool]:
+    """Control poses in their order along the path, and whether the path is closed."""
+    unit = radian_length(captured)
+    chosen = captured[_farthest_poses(captured, unit)]
+    if len(chosen) < 3:
+        return chosen, False
+    costs = _costs(chosen, captured, unit)
+    open_tour, open_length = _tour(costs, closed=False)
+    closed_tour, closed_length = _tour(costs, closed=True)
+    closed = len(chosen) >= 5 and closed_length <= _MAX_CLOSED_RATIO * open_length
+    ordered = chosen[closed_tour if closed else open_tour]
+    return _smoothed(ordered, closed=closed), closed
+
+
+def _smoothed(keys: Poses, *, closed: bool) -> Poses:
+    """The same positions with orientations smoothed along the path, weights 1 2 1."""
+    quaternions = keys.quaternions
+    for _ in range(_SMOOTHING_ROUNDS):
+        around = (
+            torch.cat((quaternions[-1:], quaternions, quaternions[:1]))
+            if closed
+            else torch.cat((quaternions[:1], quaternions, quaternions[-1:]))
+        )
+        before, after = (
+            torch.where((x * quaternions).sum(dim=1, keepdim=True) < 0, -x, x)
+            for x in (around[:-2], around[2:])
+        )
+        blend = before + 2 * quaternions + after
+        quaternions = blend / blend.norm(dim=1, keepdim=True)
+    return Poses(centres=keys.centres, quaternions=quaternions)
+
+
+def _farthest_poses(poses: Poses, unit: float) -> Int64[Tensor, "k"]:
+    """Indices of at most 30 poses by farthest-point sampling.
+
+    The first is the one nearest the mean position; repeated poses are not taken.
+    """
+    centre = poses.centres.mean(dim=0)
+    index = int((poses.centres - centre).norm(dim=1).argmin())
+    chosen: list[int] = []
+    distance = poses.centres.new_full((len(poses),), math.inf)
+    while len(chosen) < _MAX_KEYS:
+        chosen.append(index)
+        distances = (poses.centres - poses.centres[index]).norm(dim=1)
+        angles = unit * angles_between(poses.quaternions, poses.quaternions[index])
+        distance = torch.minimum(distance, distances + angles)
+        index = int(distance.argmax())
+        if float(distance[index]) <= 1e-9:
+            break
+    return torch.tensor(chosen)
+
+
+def _costs(keys: Poses, captured: Poses, unit: float) -> Float[Tensor, "k k"]:
+    """Cost between keys: distance, rotation, and distance of the midpoint from captured positions.
+
+    The last counts beyond the median distance of neighbouring captured positions.
+    """
+    distances = (keys.centres[:, None] - keys.centres).norm(dim=-1)
+    angles = unit * angles_between(keys.quaternions[:, None], keys.quaternions)
+    midway = (keys.centres[:, None] + keys.centres) / 2
+    detour = torch.cdist(midway.flatten(0, 1), captured.centres).amin(dim=1).view_as(distances)
+    apart = torch.cdist(captured.centres, captured.centres).fill_diagonal_(torch.inf)
+    detour = (detour - apart.amin(dim=1).median()).clamp_min(0)
+    return distances + angles + _DETOUR_WEIGHT * detour
+
+
+def _tour(costs: Float[Tensor, "k k"], *, closed: bool) -> tuple[Int64[Tensor, "k"], float]:
+    """A short tour: cheapest insertion in the order of the keys, improved by 2-opt."""
+    table: list[list[float]] = costs.tolist()
+    order = [0]
+    for key in range(1, len(table)):
+        row = table[key]
+        best, insert_at = row[order[-1]], len(order)
+        if closed:
+            best += row[order[0]] - table[order[-1]][order[0]]
+        elif row[order[0]] < best:
+            best, insert_at = row[order[0]], 0
+        for i, (a, b) in enumerate(pairwise(order), start=1):
+            if row[a] + row[b] - table[a][b] < best:
+                best, insert_at = row[a] + row[b] - table[a][b], i
+        order.insert(insert_at, key)
+    order = _two_opt(order, table, closed=closed)
+    return torch.tensor(order), _length(order, table, closed=closed)
+
+
+def _length(order: list[int], table: list[list[float]], *, closed: bool) -> float:
+    total = sum(table[a][b] for a, b in pairwise(order))
+    return total + (table[order[-1]][order[0]] if closed else 0.0)
+
+
+def _two_opt(order: list[int], table: list[list[float]], *, closed: bool) -> list[int]:
+    """2-opt: reverse stretches of the order as long as that makes it shorter."""
+    count = len(order)
+    improved = True
+    while improved:
+        improved = False
+        for i in range(count - 1):
+            for j in range(i + 1, count):
+                before = order[i - 1] if i > 0 or closed else None
+                after = order[(j + 1) % count] if j + 1 < count or closed else None
+                if before == order[j] or after == order[i]:
+                    continue
+                gain = 0.0
+                if before is not None:
+                    gain += table[before][order[i]] - table[before][order[j]]
+                if after is not None:
+                    gain += table[order[j]][after] - table[order[i]][after]
+                if gain > 1e-9:
+                    order[i : j + 1] = order[i : j + 1][::-1]
+                    improved = True
+    return order
+
+
+# Poses of a camera path, and distances between them.
+
+
+_RADIAN_SHARE = 0.5
+"""A radian counts as this share of the spread of the captured positions."""
+
+
+def radian_length(poses: Poses) -> float:
+    """Length that one radian counts as; 1 for a capture from one position."""
+    offsets = poses.centres - poses.centres.mean(dim=0)
+    spread = float(offsets.square().sum(dim=1).mean().sqrt())
+    return _RADIAN_SHARE * spread if spread > 1e-9 else 1.0
+
+
+def angles_between(a: Float[Tensor, "*n 4"], b: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n"]:
+    """Radians between orientations."""
+    # The arc cosine of the product would be off by 1e-8 where they agree.
+    chord = torch.minimum((a - b).norm(dim=-1), (a + b).norm(dim=-1))
+    return 4 * torch.asin((chord / 2).clamp(max=1.0))
+
+
+# Uniform cubic B-splines over poses.
+
+
+_SAMPLES_PER_SPAN = 32
+
+
+def poses_along_spline(keys: Poses, *, frames: int, closed: bool, unit: float) -> Poses:
+    """Frames at equal steps of pose space along the B-spline over the keys."""
+    if len(keys) == 1:
+        return keys[torch.zeros(frames, dtype=torch.int64)]
+    controls = _controls(keys, closed=closed)
+    spans = len(controls) - 3
+    dense = _spline(
+        controls, torch.linspace(0, spans, spans * _SAMPLES_PER_SPAN + 1, dtype=torch.float64)
+    )
+    distances = (dense.centres[1:] - dense.centres[:-1]).norm(dim=1)
+    angles = unit * angles_between(dense.quaternions[1:], dense.quaternions[:-1])
+    length = torch.cat(
+        (distances.new_zeros(1), (distances.square() + angles.square()).sqrt().cumsum(dim=0))
+    )
+    # The last frame of a closed film is one step before its first.
+    share = torch.arange(frames, dtype=torch.float64) / max(1, frames if closed else frames - 1)
+    targets = share * length[-1]
+    high = torch.searchsorted(length, targets).clamp(1, len(length) - 1)
+    low = high - 1
+    fractions = (targets - length[low]) / (length[high] - length[low]).clamp_min(1e-15)
+    return _spline(controls, (low + fractions) / _SAMPLES_PER_SPAN)
+
+
+def _controls(keys: Poses, *, closed: bool) -> Poses:
+    """Control points: keys with the neighbours that the ends need, in consistent signs.
+
+    An open spline has its end keys mirrored outwards, so that it begins and ends at them.
+    """
+    count = len(keys)
+    if closed:
+        padded = keys[torch.tensor([count - 1, *range(count), 0, 1])]
+        centres, quaternions = padded.centres, padded.quaternions
+    else:
+        quaternions = _with_consistent_signs(keys.quaternions)
+        centres, quaternions = (
+            torch.cat((2 * x[:1] - x[1:2], x, 2 * x[-1:] - x[-2:-1]))
+            for x in (keys.centres, quaternions)
+        )
+    return Poses(centres=centres, quaternions=_with_consistent_signs(quaternions))
+
+
+def _with_consistent_signs(quaternions: Float[Tensor, "n 4"]) -> Float[Tensor, "n 4"]:
+    """The same orientations with signs such that neighbouring quaternions agree."""
+    flips = (quaternions[1:] * quaternions[:-1]).sum(dim=1) < 0
+    signs = torch.where(flips, -1.0, 1.0).double().cumprod(dim=0)
+    return torch.cat((quaternions[:1], quaternions[1:] * signs[:, None]))
+
+
+def _spline(controls: Poses, parameters: Float[Tensor, "m"]) -> Poses:
+    """The B-spline at parameters from 0 to the number of controls less 3."""
+    first = parameters.floor().long().clamp(0, len(controls) - 4)
+    t = (parameters - first)[:, None]
+    basis = (
+        (1 - t) ** 3 / 6,
+        (3 * t**3 - 6 * t**2 + 4) / 6,
+        (-3 * t**3 + 3 * t**2 + 3 * t + 1) / 6,
+        t**3 / 6,
+    )
+    centres = sum(b * controls.centres[first + j] for j, b in enumerate(basis))
+    blend = sum(b * controls.quaternions[first + j] for j, b in enumerate(basis))
+    quaternions = torch.as_tensor(blend)
+    return Poses(
+        centres=torch.as_tensor(centres),
+        quaternions=quaternions / quaternions.norm(dim=1, keepdim=True).clamp_min(1e-12),
+    )

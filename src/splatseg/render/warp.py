@@ -12,10 +12,9 @@ in it:
 transpose, both are sums in a fixed order, and both are differentiable.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import torch
 from jaxtyping import Bool, Float, Int64
@@ -24,10 +23,10 @@ from torch import Tensor
 from splatseg._check import check_choice, check_shape
 from splatseg.core import Camera
 from splatseg.errors import InputError
+from splatseg.render._products import LinearMap
 
 WarpMode = Literal["bilinear", "nearest"]
 
-_MODES = ("bilinear", "nearest")
 # A point of the pinhole image that comes back elsewhere lies beyond the fold of the lens
 # polynomial; honest round trips are off by less than a millionth of a pixel.
 _FOLD_TOLERANCE = 1e-2
@@ -76,7 +75,7 @@ class Warp:
             InputError: If the cameras are not at the same place and turned alike, or `mode` is
                 unknown.
         """
-        check_choice("mode", mode, _MODES)
+        check_choice("mode", mode, get_args(WarpMode))
         if not torch.allclose(
             target.cam_from_world.detach().double(),
             source.cam_from_world.detach().double(),
@@ -104,6 +103,10 @@ class Warp:
         )
 
     @property
+    def _map(self) -> LinearMap:
+        return LinearMap(forward=self._forward.times, adjoint=self._transposed.times)
+
+    @property
     def nbytes(self) -> int:
         """Memory it holds."""
         return self._forward.nbytes + self._transposed.nbytes + self.valid.nbytes
@@ -117,7 +120,7 @@ class Warp:
             ShapeError: If the image is not of `source_shape`.
         """
         check_shape("image", image, (*self.source_shape, None))
-        flat = _product(self._forward, self._transposed, image.flatten(0, 1))
+        flat = self._map(image.flatten(0, 1))
         return flat.unflatten(0, self.target_shape)
 
     def adjoint(
@@ -129,7 +132,7 @@ class Warp:
             ShapeError: If the image is not of `target_shape`.
         """
         check_shape("image", image, (*self.target_shape, None))
-        flat = _product(self._transposed, self._forward, image.flatten(0, 1))
+        flat = self._map.transposed()(image.flatten(0, 1))
         return flat.unflatten(0, self.source_shape)
 
     def nearest_sources(
@@ -196,35 +199,17 @@ def photograph_to_pinhole(
     return warp.apply(image), warp.valid.to(image.device)
 
 
-_Lens = tuple[int, int, float, float, float, float, str, tuple[float, ...]]
+_LENS = ("width", "height", "fx", "fy", "cx", "cy", "model", "distortion")
+_Lens = tuple[Any, ...]
 
 
 def _lens(camera: Camera) -> _Lens:
-    return (
-        camera.width,
-        camera.height,
-        camera.fx,
-        camera.fy,
-        camera.cx,
-        camera.cy,
-        camera.model,
-        camera.distortion,
-    )
+    return tuple(getattr(camera, name) for name in _LENS)
 
 
 def _camera_of(lens: _Lens) -> Camera:
-    width, height, fx, fy, cx, cy, model, distortion = lens
-    return Camera(
-        width=width,
-        height=height,
-        fx=fx,
-        fy=fy,
-        cx=cx,
-        cy=cy,
-        cam_from_world=torch.eye(4, dtype=torch.float64),
-        model=model,  # pyright: ignore[reportArgumentType] -- it came out of a Camera
-        distortion=distortion,
-    )
+    pose = torch.eye(4, dtype=torch.float64)
+    return Camera(**dict(zip(_LENS, lens, strict=True)), cam_from_world=pose)
 
 
 @lru_cache(maxsize=1024)
@@ -306,7 +291,7 @@ class _Rows:
         return self.offsets.nbytes + self.columns.nbytes + self.values.nbytes
 
     def times(self, dense: Tensor) -> Tensor:
-        if not len(self.columns):
+        if not len(self.columns) or not dense.shape[1]:
             return dense.new_zeros(len(self.offsets) - 1, dense.shape[1])
         # A bag of embeddings is a row of a sparse product: weighted rows of the table, summed
         # in order, in parallel over bags.
@@ -318,26 +303,3 @@ class _Rows:
             per_sample_weights=self.values.to(dense),
             include_last_offset=True,
         )
-
-
-class _Product(torch.autograd.Function):
-    """Sparse times dense; the gradient is the transposed product."""
-
-    @staticmethod
-    def forward(ctx: Any, rows: _Rows, transposed: _Rows, dense: Tensor) -> Tensor:
-        ctx.pair = (rows, transposed)
-        return rows.times(dense)
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[None, None, Tensor]:
-        rows, transposed = ctx.pair
-        return None, None, _product(transposed, rows, gradients[0])
-
-
-_apply_product: Callable[..., Tensor] = _Product.apply  # pyright: ignore[reportAssignmentType]
-
-
-def _product(rows: _Rows, transposed: _Rows, dense: Tensor) -> Tensor:
-    if not dense.shape[1]:
-        return dense.new_zeros(len(rows.offsets) - 1, 0)
-    return _apply_product(rows, transposed, dense)

@@ -12,7 +12,7 @@ from splatseg.report.html import Block, Curves, Figure, Legend, Notice, Report, 
 from splatseg.report.images import Gallery
 from splatseg.report.words import count_text, counted, environment
 from splatseg.street.geometry import GeometryRecord
-from splatseg.street.radiance import RadianceRecord
+from splatseg.street.radiance_training import RadianceRecord
 
 _BINS = 200
 """Points of a curve of training: means of as many steps each."""

@@ -1,23 +1,118 @@
 """From points, depth, photographs and label maps to a mesh field: the paper's two stages."""
 
+import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from splatseg.core import ClassTable, LayerInfo, View
-from splatseg.core.boundary import boundary
-from splatseg.errors import InputError
+from splatseg.core.boundary import boundary, convert_fields
+from splatseg.core.options import Count, Natural, NonNegative, Positive, options
+from splatseg.errors import InputError, RangeError
 from splatseg.io.evidence import Evidence
-from splatseg.street.field import MeshField, with_vertex_rule
-from splatseg.street.geometry import DepthView, GeometryFit, GeometryRecord, fit_geometry
-from splatseg.street.options import DnmpOptions
-from splatseg.street.primitives import Primitives, voxel_primitives
-from splatseg.street.radiance import RadianceFit, RadianceRecord, train_radiance
-from splatseg.street.shapes import load_shapes
+from splatseg.street.depth_views import DepthView
+from splatseg.street.field import MeshField, VertexRule, with_vertex_rule
+from splatseg.street.geometry import (
+    PUBLISHED_GEOMETRY,
+    GeometryFit,
+    GeometryOptions,
+    GeometryRecord,
+    fit_geometry,
+)
+from splatseg.street.primitives import PrimitiveMesh, Primitives, voxel_primitives
+from splatseg.street.radiance import PUBLISHED_RADIANCE, RadianceOptions
+from splatseg.street.radiance_training import RadianceFit, RadianceRecord, train_radiance
+from splatseg.street.shape_files import load_shapes
+
+Setting = Literal["fast", "published"]
+"""fast: networks and rates that are sized for two cores.
+published: those of the papers and of DNMP's public code."""
+
+
+@options(
+    removed={
+        "coarse": "all levels have primitives in all voxels with points, as published",
+        "start": "primitives start as near spheres, as published",
+        "memory": "hits of more than 1 GiB lie in temporary files",
+    }
+)
+class DnmpOptions:
+    """How a mesh field is made: primitives in voxels, their shapes, their colours and classes."""
+
+    setting: Setting = "fast"
+    """fast: networks and rates for two cores. published: those of the papers. What is given below
+    counts before it."""
+
+    voxels: tuple[float, ...] = (0.5, 1.0)
+    """Sides of the voxels of the levels, metres."""
+
+    geometry_iterations: Natural | None = None
+    """Steps of the fit of shapes to depth. None is the setting's."""
+
+    carve: Positive | None = None
+    """Primitives are removed through which this share of their rays sees further than a voxel; and
+    those with a camera inside, which are refused without. None is 0.9, or none with published."""
+
+    iterations: Count | None = None
+    """Steps of the training of colours and classes. None is the setting's."""
+
+    rays: Count | None = None
+    """Rays of a step of that training. None is the setting's 4096."""
+
+    semantic_weight: NonNegative | None = None
+    """Weight of the cross-entropy of classes beside the squared error of colours. None is 0.3,
+    or 0.1 with published."""
+
+    radius: Positive | None = None
+    """Of the ball around a point, metres, whose vertices label it. None is the side of the finest
+    voxels."""
+
+    vertex_rule: VertexRule | None = None
+    """Which vertices in that ball are asked (eq. 9). adjusted: those whose features training
+    adjusted, as published; a point with none has no label. weighed: all, each by how much training
+    rays saw of it, 0.01 at least. all: all alike. None is weighed, or adjusted with published."""
+
+    def __post_init__(self) -> None:
+        if not self.voxels or not all(0 < side < math.inf for side in self.voxels):
+            raise RangeError(f"voxels: expected positive lengths in metres, got {self.voxels}.")
+
+    @property
+    def geometry(self) -> GeometryOptions:
+        """The same for `fit_geometry`."""
+        fast = self.setting == "fast"
+        options = replace(GeometryOptions(), carve=_CARVE) if fast else PUBLISHED_GEOMETRY
+        return replace(options, **_given(iterations=self.geometry_iterations, carve=self.carve))
+
+    @property
+    def radiance(self) -> RadianceOptions:
+        """The same for `train_radiance`."""
+        options = RadianceOptions() if self.setting == "fast" else PUBLISHED_RADIANCE
+        given = _given(
+            iterations=self.iterations, rays=self.rays, semantic_weight=self.semantic_weight
+        )
+        return replace(options, **given)
+
+    @property
+    def effective_vertex_rule(self) -> VertexRule:
+        """The rule of eq. 9, of the setting where none was given."""
+        if self.vertex_rule is not None:
+            return self.vertex_rule
+        return "weighed" if self.setting == "fast" else "adjusted"
+
+
+_CARVE = 0.9
+
+
+def _given(**values: Any) -> dict[str, Any]:
+    return {name: value for name, value in values.items() if value is not None}
+
+
+PUBLISHED = DnmpOptions(setting="published")
+
 
 METHOD_NAME = "dnmp"
 
@@ -44,19 +139,40 @@ class MeshFieldFit:
     radiance: RadianceFit
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MeshFieldInputs:
+    """What a mesh field is built from."""
+
+    points: Float[Tensor, "n 3"]
+    """On surfaces, world, scene units."""
+
+    depths: Iterable[DepthView]
+    """Depth of views, read once."""
+
+    views: Sequence[View]
+    """Views to learn from, with photographs."""
+
+    evidence: Evidence
+    """Their label maps."""
+
+    classes: ClassTable | None = None
+    """The classes, of which a label that is not in the table is refused; None takes the ids of the
+    maps."""
+
+    metres_per_unit: float = 1.0
+    """Length of a scene unit, metres."""
+
+    def __post_init__(self) -> None:
+        convert_fields(self)
+
+
 @boundary
 def build_mesh_field(
-    points: Float[Tensor, "n 3"],
-    depths: Iterable[DepthView],
-    views: Sequence[View],
-    evidence: Evidence,
+    inputs: MeshFieldInputs,
     *,
     options: DnmpOptions | None = None,
     layer: str = "semantic",
-    classes: ClassTable | None = None,
-    metres_per_unit: float = 1.0,
     seed: int = 0,
-    cache_folder: Path | None = None,
     progress: Stage | None = None,
 ) -> MeshFieldFit:
     """Put primitives at points, fit their shapes to depth, learn their colours and classes.
@@ -64,17 +180,10 @@ def build_mesh_field(
     Features of vertices are rounded to float16 in the end, so that a saved field is the same.
 
     Args:
-        points: On surfaces, world, scene units.
-        depths: Depth of views, read once.
-        views: To learn from, with photographs.
-        evidence: Their label maps.
+        inputs: Points, depth, photographs and label maps.
         options: How it is made.
         layer: Name of the field's layer.
-        classes: The classes, of which a label that is not in the table is refused; None takes
-            the ids of the maps.
-        metres_per_unit: Length of a scene unit.
         seed: Of all random choices.
-        cache_folder: Where hits that exceed the memory given are kept for the next training.
         progress: Told of the progress.
 
     Raises:
@@ -83,16 +192,11 @@ def build_mesh_field(
             be used.
     """
     options = options or DnmpOptions()
-    shapes = load_shapes()
+    shapes, metres, classes = load_shapes(), inputs.metres_per_unit, inputs.classes
     primitives = voxel_primitives(
-        points,
-        shapes=shapes,
-        sizes=options.voxels,
-        metres_per_unit=metres_per_unit,
-        coarse=options.coarse,
-        start=options.start,
+        inputs.points, shapes=shapes, sizes=options.voxels, metres_per_unit=metres
     )
-    _check_several(primitives, len(points), options, metres_per_unit)
+    _check_several(primitives, len(inputs.points), options, metres)
 
     steps = options.geometry.iterations * len(options.voxels)
 
@@ -107,59 +211,65 @@ def build_mesh_field(
     shaped = fit_geometry(
         primitives,
         shapes,
-        depths,
+        inputs.depths,
         options=options.geometry,
         seed=seed,
-        metres_per_unit=metres_per_unit,
+        metres_per_unit=metres,
         progress=shaping,
     )
     mesh = shaped.primitives.mesh(shapes)
     trained = train_radiance(
         mesh,
-        views,
-        evidence,
+        inputs.views,
+        inputs.evidence,
         ids=None if classes is None else [row.id for row in classes.rows],
         options=options.radiance,
         seed=seed,
-        cache_folder=cache_folder,
         progress=learning,
     )
-    model = trained.model
     with torch.no_grad():
-        model.features.copy_(model.features.half().float())
+        trained.model.features.copy_(trained.model.features.half().float())
     seen = seen_shares(trained.seen)
-    names = {} if classes is None else {row.id: row.name for row in classes.rows}
-    info = LayerInfo(
+    info = _record(inputs, options, shaped, mesh, trained, seed=seed)
+    field = MeshField(
+        mesh,
+        trained.model,
+        layer=layer,
+        info=with_vertex_rule(info, options.effective_vertex_rule),
+        radius=None if options.radius is None else options.radius / metres,
+        seen=seen,
+        vertex_rule=options.effective_vertex_rule,
+    )
+    return MeshFieldFit(field=field, start=primitives, geometry=shaped, radiance=trained)
+
+
+def _record(
+    inputs: MeshFieldInputs,
+    options: DnmpOptions,
+    shaped: GeometryFit,
+    mesh: PrimitiveMesh,
+    trained: RadianceFit,
+    *,
+    seed: int,
+) -> LayerInfo:
+    """What the field's layer records of how it was made."""
+    names = {} if inputs.classes is None else {row.id: row.name for row in inputs.classes.rows}
+    return LayerInfo(
         method=METHOD_NAME,
         options=asdict(options),
-        views=tuple(view.name for view in views),
-        names={id: names[id] for id in sorted(model.ids) if id in names},
+        views=tuple(view.name for view in inputs.views),
+        names={id: names[id] for id in sorted(trained.model.ids) if id in names},
         seed=seed,
         details={
             "primitives": [int((mesh.levels == i).sum()) for i in range(len(mesh.sizes))],
-            "points": len(points),
+            "points": len(inputs.points),
             "removed_around_cameras": shaped.enclosing,
             "removed_before_surfaces": shaped.carved,
             "rays": trained.rays,
             "hits": trained.hits,
-            "vertices": len(seen),
-            "adjusted_vertices": int((seen > 0).sum()),
+            "vertices": len(trained.seen),
+            "adjusted_vertices": int((trained.seen > 0).sum()),
         },
-    )
-    radius = None if options.radius is None else options.radius / metres_per_unit
-    return MeshFieldFit(
-        field=MeshField(
-            mesh,
-            model,
-            layer=layer,
-            info=with_vertex_rule(info, options.asked_vertices),
-            radius=radius,
-            seen=seen,
-            vertex_rule=options.asked_vertices,
-        ),
-        start=primitives,
-        geometry=shaped,
-        radiance=trained,
     )
 
 

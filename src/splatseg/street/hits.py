@@ -1,8 +1,8 @@
-r"""All triangles of primitives that rays meet, nearest first: what eq. 3 to 5 are about.
+"""All triangles of primitives that rays meet, nearest first: what eq. 3 to 5 are about.
 
 A ray meets a watertight primitive from outside an even number of times, whether it passes through
 faces, edges or vertices: what lies exactly on an edge is counted as if the ray passed infinitely
-little aside. The search is native (``native/mesh_hits.h``); `splatseg.street.hits_reference` tries
+little aside. The search is native (``native/mesh_hits.h``); `splatseg.street.hits` tries
 every triangle.
 
 Primitives of several levels fill the same places. ``fine_hits`` and ``coarse_hits`` limit how many
@@ -20,11 +20,14 @@ from torch import Tensor
 
 from splatseg import _native
 from splatseg._check import check_choice, check_finite, check_range, check_shape
+from splatseg.core import Camera
 from splatseg.core.boundary import boundary
 from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError, RangeError
-from splatseg.street.mesh import PrimitiveMesh
-from splatseg.street.shapes.template import FACES, VERTICES, template
+from splatseg.raycast import RayHits
+from splatseg.street.depth_views import axis_cosines
+from splatseg.street.primitives import PrimitiveMesh
+from splatseg.street.shapes import FACES, VERTICES, template
 
 Sides = Literal["both", "front"]
 """both: triangles are met from outside and from inside their primitive, as published. front: from
@@ -218,3 +221,112 @@ def _merged(found: list[MeshHits], width: int) -> MeshHits:
         distances=ordered,
         weights=weights.gather(1, order[..., None].expand(-1, -1, 3)),
     )
+
+
+# What rays meet first: fine primitives over coarse ones.
+
+
+class PrimitiveCaster:
+    """A mesh of primitives, arranged level by level to be met by rays.
+
+    Args:
+        mesh: With at least one primitive.
+
+    Raises:
+        InputError: If it has none.
+    """
+
+    @boundary
+    def __init__(self, mesh: PrimitiveMesh) -> None:
+        if not len(mesh):
+            raise InputError("mesh: expected at least one primitive, got none.")
+        self._levels = mesh.levels.cpu()
+        self._caster = MeshCaster(mesh)
+
+    @boundary
+    def first(self, origins: Float[Tensor, "*n 3"], directions: Float[Tensor, "n 3"]) -> RayHits:
+        """The first triangle of the finest level that a ray meets at all.
+
+        Args:
+            origins: Where rays start, world: one each, or one point for all.
+            directions: Where they go.
+
+        Returns:
+            Hits, their faces those of the mesh.
+        """
+        levels = len(self._caster.mesh.sizes)
+        hits = self._caster.hits(origins, directions, max_hits=levels, fine_hits=1, coarse_hits=1)
+        level = torch.where(hits.valid, self._levels[hits.faces.clamp_min(0) // FACES], levels)
+        finest = level.argmin(dim=1, keepdim=True)
+        return RayHits(
+            faces=hits.faces.gather(1, finest)[:, 0],
+            distances=hits.distances.gather(1, finest)[:, 0],
+            weights=hits.weights.gather(1, finest[..., None].expand(-1, -1, 3))[:, 0].double(),
+        )
+
+
+@boundary
+def mesh_distances(
+    mesh: PrimitiveMesh | PrimitiveCaster, camera: Camera
+) -> Float[Tensor, "height width"]:
+    """Distances from the camera's centre to the first hits of the pixels' rays, float32, 0 none.
+
+    Args:
+        mesh: The mesh, or the caster of a mesh that is looked at from several cameras.
+        camera: Its pixels.
+    """
+    caster = mesh if isinstance(mesh, PrimitiveCaster) else PrimitiveCaster(mesh)
+    origin, directions = camera.rays()
+    hits = caster.first(origin, directions.reshape(-1, 3))
+    found = torch.where(hits.faces >= 0, hits.distances, 0.0)
+    return found.view(camera.height, camera.width).float()
+
+
+@boundary
+def mesh_depth(
+    mesh: PrimitiveMesh | PrimitiveCaster, camera: Camera
+) -> Float[Tensor, "height width"]:
+    """z-depth of the first hits of the pixels' rays, scene units, float32, 0 where there is none.
+
+    Args:
+        mesh: The mesh, or the caster of a mesh that is looked at from several cameras.
+        camera: Its pixels.
+    """
+    _, directions = camera.rays()
+    return (mesh_distances(mesh, camera) * axis_cosines(camera, directions)).float()
+
+
+# Which primitives enclose a point: by the solid angle that their faces fill around it.
+#
+# Of a triangle with corners a, b, c as seen from the point,
+#
+# .. math:: \tan(\Omega / 2) = \frac{a \cdot (b \times c)}
+#     {|a||b||c| + (a \cdot b)|c| + (b \cdot c)|a| + (c \cdot a)|b|}
+#
+# and the sum over a watertight mesh is :math:`4 \pi` inside and 0 outside.
+#
+# References:
+#     Van Oosterom and Strackee, The Solid Angle of a Plane Triangle (1983).
+
+
+@boundary
+def enclosing(mesh: PrimitiveMesh, points: Float[Tensor, "p 3"]) -> Bool[Tensor, "m"]:
+    """Which primitives of a mesh have one of the points inside.
+
+    Args:
+        mesh: The primitives.
+        points: Such as the centres of cameras, world.
+    """
+    _, faces = template()
+    shapes = mesh.vertices.view(-1, VERTICES, 3).double()
+    low, high = shapes.amin(dim=1), shapes.amax(dim=1)
+    found = torch.zeros(len(mesh), dtype=torch.bool)
+    for point in points.detach().cpu().double():
+        near = ((low <= point) & (point <= high)).all(dim=1).nonzero()[:, 0]
+        a, b, c = (shapes[near][:, faces] - point).unbind(dim=2)
+        la, lb, lc = (torch.linalg.vector_norm(side, dim=-1) for side in (a, b, c))
+        volume = (a * torch.linalg.cross(b, c)).sum(-1)
+        below = la * lb * lc + (a * b).sum(-1) * lc + (b * c).sum(-1) * la + (c * a).sum(-1) * lb
+        angle = 2 * torch.atan2(volume, below).sum(dim=1)
+        found[near[angle > 2 * math.pi]] = True
+    return found

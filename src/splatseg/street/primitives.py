@@ -1,45 +1,94 @@
-"""Primitives: codes with places in the world, made of voxels that hold points.
-
-Each level is a grid of its own. As published, every voxel that holds a point gets a primitive at
-every level, and rays look at the fine ones over the coarse ones.
-"""
+"""Primitives as one triangle mesh: what rays hit, and whose vertices carry features."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn import functional
 
-from splatseg._check import check_choice, check_finite, check_range, check_shape
+from splatseg._check import check_finite, check_shape
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError, RangeError
 from splatseg.lift.points.thin import thin
-from splatseg.street.mesh import PrimitiveMesh
-from splatseg.street.shapes import ShapeAutoEncoder, primitive_scale, sphere_code
-from splatseg.street.shapes.template import VERTICES
+from splatseg.street.shapes import (
+    FACES,
+    VERTICES,
+    ShapeAutoEncoder,
+    primitive_scale,
+    sphere_code,
+    template,
+)
 
-CoarseRule = Literal["everywhere", "sparse"]
-"""everywhere: each level covers all points, as published. sparse: a level covers the voxels in
-which the next finer one has too few points."""
 
-StartShape = Literal["sphere", "encoded"]
-"""sphere: codes of the near sphere, as published. encoded: what the encoder makes of the points
-of a voxel."""
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PrimitiveMesh:
+    """Deformed icospheres in the world, level by level.
+
+    Primitive i has the vertices 42 i to 42 i + 41 and the faces 80 i to 80 i + 79, each with the
+    corners of its template face.
+
+    Raises:
+        ShapeError: If there are not 42 vertices and one level a primitive.
+        RangeError: If a vertex is not finite, or a level has no size.
+    """
+
+    vertices: Float[Tensor, "v 3"]
+    """World, scene units, float32."""
+
+    levels: Int[Tensor, "m"]
+    """Level of each primitive, int64; 0 is the finest."""
+
+    sizes: tuple[float, ...]
+    """Side of the voxels of each level, scene units, ascending."""
+
+    def __post_init__(self) -> None:
+        convert_fields(self)
+        check_shape("levels", self.levels, (None,))
+        check_shape("vertices", self.vertices, (VERTICES * len(self.levels), 3))
+        check_finite("vertices", self.vertices)
+        if len(self.levels) and not 0 <= int(self.levels.min()) <= int(self.levels.max()) < len(
+            self.sizes
+        ):
+            raise RangeError(
+                f"levels: expected levels of {len(self.sizes)} sizes, got "
+                f"[{int(self.levels.min())}, {int(self.levels.max())}]."
+            )
+        if list(self.sizes) != sorted(self.sizes) or not all(size > 0 for size in self.sizes):
+            raise RangeError(f"sizes: expected positive lengths, ascending, got {self.sizes}.")
+        object.__setattr__(self, "vertices", self.vertices.float())
+        object.__setattr__(self, "levels", self.levels.long())
+
+    def __len__(self) -> int:
+        """How many primitives there are."""
+        return len(self.levels)
+
+    @property
+    def faces(self) -> Int[Tensor, "f 3"]:
+        """Corners of every triangle, int64."""
+        return primitive_faces(len(self.levels))
+
+
+def primitive_faces(count: int) -> Int[Tensor, "f 3"]:
+    """Corners of the triangles of primitives whose vertices follow each other."""
+    _, faces = template()
+    first = VERTICES * torch.arange(count)
+    return (first[:, None, None] + faces).reshape(FACES * count, 3)
+
+
+# Primitives: codes with places in the world, made of voxels that hold points.
+#
+# Each level is a grid of its own. As published, every voxel that holds a point gets a primitive at
+# every level, and rays look at the fine ones over the coarse ones.
+
 
 _UNIT = 1e-3
 _DECODED = 8192
 """Primitives that are decoded together where no gradient is wanted."""
 
 _MAX_INDEX = 1 << 20
-_ENCODED_POINTS = 128
-_ENCODED = 256
-_MIN_ENCODED_POINTS = 8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -152,9 +201,6 @@ def voxel_primitives(
     shapes: ShapeAutoEncoder,
     sizes: Sequence[float] = (0.5, 1.0),
     metres_per_unit: float = 1.0,
-    coarse: CoarseRule = "everywhere",
-    start: StartShape = "sphere",
-    min_points: int = 1,
     sphere: Float[Tensor, "mu"] | None = None,
 ) -> Primitives:
     """One primitive in each voxel that holds points, level by level; the order of points is free.
@@ -168,10 +214,6 @@ def voxel_primitives(
         shapes: The auto-encoder of the codes.
         sizes: Sides of the voxels of the levels, metres.
         metres_per_unit: Length of a scene unit.
-        coarse: Where levels above the finest have primitives.
-        start: What the codes are at first. A voxel with fewer than 8 points is a sphere.
-        min_points: Points that a voxel needs; with coarse ``sparse`` what fails is left to the
-            next level, and the coarsest level takes all.
         sphere: `shapes.sphere_code` of the shapes, where the caller has it already; None searches
             for it, which takes about a second.
 
@@ -182,11 +224,10 @@ def voxel_primitives(
         ShapeError: If points are not (n, 3).
         RangeError: If a point is not finite or too far away to count voxels, or a length is not
             positive.
-        InputError: If there are no points, no voxel holds enough of them, or the shapes have no
-            encoder that ``encoded`` asks for.
+        InputError: If there are no points.
 
     Example:
-        >>> from splatseg.street.shapes import load_shapes
+        >>> from splatseg.street.shape_files import load_shapes
         >>> made = voxel_primitives(torch.tensor([[0.1, 0.1, 0.1], [0.9, 0.1, 0.1]]),
         ...                         shapes=load_shapes())
         >>> made.levels.tolist()
@@ -194,9 +235,6 @@ def voxel_primitives(
     """
     check_shape("points", points, (None, 3))
     check_finite("points", points)
-    check_choice("coarse", coarse, ("everywhere", "sparse"))
-    check_choice("start", start, ("sphere", "encoded"))
-    check_range("min_points", min_points, 1, 1_000_000)
     if not len(points):
         raise InputError("points: expected at least one point to put a primitive at, got none.")
     if not 0 < metres_per_unit < math.inf:
@@ -207,76 +245,23 @@ def voxel_primitives(
     units = tuple(size / metres_per_unit for size in sorted(sizes))
     sphere = (sphere_code(shapes) if sphere is None else sphere).detach().cpu().float()
     check_shape("sphere", sphere, (shapes.code_size,))
-    left = torch.ones(len(cloud), dtype=torch.bool)
-    found: list[tuple[Tensor, Tensor]] = []
-    for level, size in enumerate(units):
-        last = level == len(units) - 1
-        rows = left.nonzero()[:, 0]
-        enough = 1 if last and coarse == "sparse" else min_points
-        centres, owners = _voxels(cloud[rows], size, enough)
-        if coarse == "sparse":
-            left[rows[owners >= 0]] = False
-        codes = sphere.expand(len(centres), -1)
-        if start == "encoded":
-            filled = _Filled(cloud[rows], owners, centres, primitive_scale(size))
-            codes = _encoded(shapes, filled, sphere)
-        found.append((centres, codes))
-    counts = [len(centres) for centres, _ in found]
-    if not sum(counts):
-        raise InputError(
-            f"points: expected voxels with {min_points} points each, got none among "
-            f"{len(points)} points."
-        )
-    repeats = torch.tensor(counts)
+    centres = [_voxels(cloud, size) for size in units]
+    counts = torch.tensor([len(level) for level in centres])
     return Primitives(
-        codes=torch.cat([codes for _, codes in found]),
-        centres=torch.cat([centres for centres, _ in found]),
-        scales=torch.tensor([primitive_scale(size) for size in units]).repeat_interleave(repeats),
-        levels=torch.arange(len(units)).repeat_interleave(repeats),
+        codes=sphere.repeat(int(counts.sum()), 1),
+        centres=torch.cat(centres),
+        scales=torch.tensor([primitive_scale(size) for size in units]).repeat_interleave(counts),
+        levels=torch.arange(len(units)).repeat_interleave(counts),
         sizes=units,
     )
 
 
-def _voxels(points: Tensor, size: float, enough: int) -> tuple[Tensor, Tensor]:
-    """Means of the points of voxels that hold enough of them, and the voxel of each point or -1."""
-    if not len(points):
-        return points.new_zeros(0, 3), torch.zeros(0, dtype=torch.int64)
+def _voxels(points: Tensor, size: float) -> Tensor:
+    """Means of the points of voxels that hold some."""
     furthest = float(points.abs().max())
     if furthest / size >= _MAX_INDEX - 1:
         raise RangeError(
             f"points: expected coordinates within {_MAX_INDEX} voxels of the origin, got "
             f"{furthest:g} for voxels of {size:g}."
         )
-    cells = thin(points, size)
-    kept = torch.bincount(cells.cell_of) >= enough
-    index = torch.where(kept, kept.cumsum(0) - 1, -1)
-    return cells.centres[kept], index[cells.cell_of]
-
-
-def _encoded(shapes: ShapeAutoEncoder, voxels: "_Filled", sphere: Tensor) -> Tensor:
-    """Codes of the points of voxels, spheres where they are few."""
-    codes = sphere.repeat(len(voxels.centres), 1)
-    inside = (voxels.owners >= 0).nonzero()[:, 0]
-    x, y, z = voxels.points[inside].numpy().T
-    order = inside[torch.from_numpy(np.lexsort((z, y, x, voxels.owners[inside].numpy())))]
-    counts = torch.bincount(voxels.owners[inside], minlength=len(codes))
-    starts = counts.cumsum(0) - counts
-    dense = (counts >= _MIN_ENCODED_POINTS).nonzero()[:, 0]
-    share = torch.arange(_ENCODED_POINTS)
-    with torch.no_grad(), one_torch_thread():
-        for part in dense.split(_ENCODED):
-            # Evenly over a voxel's points; a repeated point changes no maximum.
-            steps = share * counts[part, None] // _ENCODED_POINTS
-            rows = order[starts[part, None] + steps]
-            local = voxels.points[rows] - voxels.centres[part, None]
-            codes[part] = shapes.encode((local / voxels.scale).float())
-    return functional.normalize(codes, dim=1)
-
-
-class _Filled(NamedTuple):
-    """Points, the voxel of each or -1, the voxels' centres, and the unit of their shapes."""
-
-    points: Tensor
-    owners: Tensor
-    centres: Tensor
-    scale: float
+    return thin(points, size).centres

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -146,4 +146,4 @@ def _pairs(
 
 def _poses(root: Path) -> dict[str, Any] | None:
     report = load_pose_report(root / POSES_FOLDER)
-    return None if report is None else report.as_json()
+    return None if report is None else asdict(report)

@@ -8,11 +8,14 @@ import torch
 
 from splatseg.core import Capture, DepthMap, PointCloud, ScanSource, View
 from splatseg.errors import InputError
-from splatseg.fit import DepthPoints, ScanDepthOptions, scan_depths
+from splatseg.fit import DepthPoints, scan_depths
 from splatseg.io.evidence import save_depth_map
 
 EVIDENCE = "depth_scans"
 """Folder of the depth maps in the evidence of a scene."""
+
+_START_CELL = 0.12
+"""Metres: side of the cells of which each gives one point to start from."""
 
 
 def with_scans(
@@ -21,7 +24,6 @@ def with_scans(
     *,
     scene: Path,
     report: Callable[[str], None],
-    options: ScanDepthOptions | None = None,
 ) -> Capture:
     """The capture whose training views have depth maps of scans, and whose points are theirs too.
 
@@ -32,20 +34,16 @@ def with_scans(
         scans: Scans of the same drive, in the same world.
         scene: The scene folder that the fit writes.
         report: Told in a sentence what the user should know.
-        options: How scans become depth maps.
 
     Raises:
         InputError: If no point of any scan is seen by a training view.
     """
-    options = options or ScanDepthOptions()
     metres = capture.metres_per_unit or 1.0
     train = capture.train_views
     folder = scene / "evidence" / EVIDENCE
-    points = DepthPoints(options.start_cell / metres)
+    points = DepthPoints(_START_CELL / metres)
     seen: dict[str, Path] = {}
-    maps = scan_depths(
-        scans, [view.camera for view in train], options=options, metres_per_unit=metres
-    )
+    maps = scan_depths(scans, [view.camera for view in train], metres_per_unit=metres)
     for view, depth in zip(train, maps, strict=True):
         if not bool((depth > 0).any()):
             continue

@@ -234,7 +234,7 @@ def _stopped_notes(root: Path) -> list[str]:
 
 def _field_notes(root: Path) -> list[str]:
     """What lacks of fields of drives in blocks."""
-    from splatseg.street.blocks import load_drive, missing_blocks  # here: most scenes have none
+    from splatseg.street.files import load_drive, missing_blocks
 
     notes: list[str] = []
     for name in scene_field_names(root):

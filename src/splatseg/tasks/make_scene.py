@@ -209,7 +209,7 @@ def fit_capture(
             scoring=not stopped,
             command=command,
             timings=timings,
-            poses=None if poses is None else poses.as_json(),
+            poses=None if poses is None else asdict(poses),
         )
         # Not before the report: who is stopped there can resume, and gets it.
         if not (stopped or options.keep_checkpoint):

@@ -20,7 +20,7 @@ from splatseg.io.scans import Scans, read_scans
 from splatseg.io.scene import load_scene_layer, scene_layer_names
 from splatseg.lift.points import ViewedPointOptions, ViewedPoints
 from splatseg.render import BackendName
-from splatseg.street.blocks import DriveField, ScanLabeller
+from splatseg.street.block_field import DriveField, ScanLabeller
 from splatseg.street.field import MeshField
 from splatseg.tasks._observer import SILENT, Observer
 from splatseg.tasks.scene_parts import gaussian_field

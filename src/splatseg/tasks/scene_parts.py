@@ -148,8 +148,7 @@ def scene_field(scene: Scene, name: str, *, vertex_rule: "VertexRule | None" = N
         FileFormatError: If its file is damaged.
     """
     # Here, as most commands need no street.
-    from splatseg.street.blocks import open_blocks
-    from splatseg.street.files import load_mesh_field
+    from splatseg.street.files import load_mesh_field, open_blocks
 
     if scene.root is None:
         raise InputError(f"field {name!r:.80}: the scene has no folder to read it from.")

@@ -6,20 +6,29 @@ import numpy as np
 import pytest
 import torch
 
+from splatseg.core import Pointmap
+from splatseg.core.rigid import best_similarity
 from splatseg.errors import InputError
-from splatseg.pose.pointmaps._averaging import average, geman_mcclure, graph_solve
-from splatseg.pose.pointmaps._focal import lens_focals, weiszfeld_focal
-from splatseg.pose.pointmaps._geometry import pair_geometry, ray_directions
-from splatseg.pose.pointmaps._resection import resect, similarity
-from splatseg.pose.pointmaps._start import (
+from splatseg.pose._pointmap_align import Aligned
+from splatseg.pose._pointmap_pixels import PairSamples, PhotographSize
+from splatseg.pose._pointmap_start import (
     agreement,
+    average,
     confidence_score,
+    geman_mcclure,
+    graph_solve,
+    lens_focals,
+    pair_geometry,
+    ray_directions,
+    resect,
     rotation_angle,
     rotation_of_vector,
     rotation_vector,
     spanning_tree,
     tree_world,
+    weiszfeld_focal,
 )
+from splatseg.pose.pointmaps import read_depth_maps
 from splatseg_bench.worlds import PointmapErrors
 from support.pointmaps import complete, window
 
@@ -91,7 +100,7 @@ def test_similarity_is_found_exactly(rng) -> None:
     turn = rotation_of_vector(torch.from_numpy(rng.normal(size=(3, 3))))
     target = 2.5 * source @ turn.transpose(1, 2) + 1
     weights = torch.from_numpy(rng.uniform(1, 2, size=(3, 20)))
-    scale, rotation, shift = similarity(source, target, weights)
+    scale, rotation, shift = best_similarity(source, target, weights)
     torch.testing.assert_close(scale, torch.full((3,), 2.5).double())
     torch.testing.assert_close(rotation, turn)
     torch.testing.assert_close(shift, torch.ones(3, 3).double())
@@ -139,7 +148,7 @@ def test_exact_pairs_give_exact_worlds_along_the_tree_and_on_average(photographe
             off = rotation_angle(turn @ found.rotation[i] @ camera.cam_from_world[:3, :3])
             assert math.degrees(float(off)) < 0.05
         ours, theirs = found.centre, torch.stack([camera.centre for camera in true])
-        scale, turned, shift = similarity(ours[None], theirs[None], torch.ones(1, 8).double())
+        scale, turned, shift = best_similarity(ours[None], theirs[None], torch.ones(1, 8).double())
         moved = scale * ours @ turned[0].T + shift
         assert float((moved - theirs).norm(dim=1).max()) < 2e-3 * float(theirs.std(dim=0).norm())
 
@@ -173,3 +182,64 @@ def test_a_lens_that_is_first_of_no_pair_has_no_focal_length(photographed) -> No
     object.__setattr__(samples, "lenses", alone)
     with pytest.raises(InputError, match="a pair with photograph 3 of 8"):
         lens_focals(samples)
+
+
+# Depth maps of photographs from their pairs, solved by hand.
+
+
+SIZES = ((2, 3), (2, 3))
+PHOTOGRAPHS = [PhotographSize(name=name, width=6, height=4) for name in ("a", "b")]
+
+
+class Flat:
+    """Walls that face the camera, at a depth of each pair; e times as sure as not at all."""
+
+    def __init__(self, depths: dict[tuple[str, str], float]) -> None:
+        self.depths = depths
+        self.asked: list[tuple[str, str]] = []
+
+    def pointmaps(self, first: str, second: str) -> tuple[Pointmap, Pointmap]:
+        self.asked.append((first, second))
+        points = torch.zeros(*SIZES[0], 3)
+        points[..., 2] = self.depths[first, second]
+        one = Pointmap(points=points, confidence=torch.full(SIZES[0], math.e))
+        return one, one
+
+
+def _aligned(weight: list[float], scale: list[float]) -> Aligned:
+    """Cameras and pairs all in the same place, directed alike."""
+    count = len(weight)
+    return Aligned(
+        rotation=torch.eye(3).double().repeat(2, 1, 1),
+        centre=torch.zeros(2, 3).double(),
+        focal=torch.full((2,), 5.0).double(),
+        depth=torch.ones(2, 1).double(),
+        scale=torch.tensor(scale).double(),
+        pair_rotation=torch.eye(3).double().repeat(count, 1, 1),
+        pair_translation=torch.zeros(count, 3).double(),
+        residual=torch.zeros(count).double(),
+        weight=torch.tensor(weight).double(),
+    )
+
+
+def test_depths_are_means_of_logarithms_weighted_by_how_much_pairs_are_believed() -> None:
+    """Depths 2 with weight 1 and 2 x 2 with 0.5; a third pair, 100 away, is not even read."""
+    pairs = torch.tensor([0, 1, 0]), torch.tensor([1, 0, 1])
+    samples = PairSamples(
+        first=pairs[0],
+        second=pairs[1],
+        points=torch.zeros(3, 2, 1, 3),
+        weights=torch.ones(3, 2, 1),
+        offsets=torch.zeros(2, 1, 2).double(),
+        lenses=torch.zeros(2, dtype=torch.int64),
+        sizes=SIZES,
+    )
+    source = Flat({("a", "b"): 2.0, ("b", "a"): 2.0})
+    world = _aligned([1.0, 0.5, 0.2], [1.0, 2.0, 50.0])
+    maps = read_depth_maps(PHOTOGRAPHS, samples, world, source, progress=lambda done, total: None)
+    assert source.asked == [("a", "b"), ("b", "a")]
+    mean = (1.0 * math.log(2) + 0.5 * math.log(4)) / 1.5
+    spread = (1.0 * math.log(2) ** 2 + 0.5 * math.log(4) ** 2) / 1.5 - mean**2
+    for depth, sure in zip(maps.depth, maps.sure, strict=True):
+        torch.testing.assert_close(depth, torch.full(SIZES[0], math.exp(mean)))
+        assert float(sure[0, 0]) == pytest.approx(1.5 / (1 + spread / 0.05**2), rel=1e-4)

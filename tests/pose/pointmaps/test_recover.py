@@ -9,12 +9,20 @@ import torch
 from splatseg.core import Pointmap, PointmapModel
 from splatseg.errors import InputError, MissingFileError
 from splatseg.io.pointmaps import open_pointmaps
+from splatseg.pose import _pointmap_pixels, pointmaps
 from splatseg.pose.pointmaps import PointmapOptions, recover_from_pointmaps
 from splatseg_bench.worlds import PointmapErrors, SyntheticPointmaps
 from support.pointmaps import PhotographedRoom, complete, window
 
 WRONG = PointmapErrors(noise=0.02, warp=0.03, outliers=0.1)
-FEW = PointmapOptions(samples=300, iterations=20, max_points=4000)
+FEW = PointmapOptions(max_points=4000)
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch) -> None:
+    """Fewer pixels and steps."""
+    monkeypatch.setattr(pointmaps, "_SAMPLES", 300)
+    monkeypatch.setattr(pointmaps, "_ROBUST_ITERATIONS", 20)
 
 
 @dataclass
@@ -85,7 +93,7 @@ def test_what_was_found_is_read_again_until_the_options_change(tmp_path, photogr
     assert (one.reused, two.reused) == (False, True)
     assert two.report == one.report
     assert torch.equal(two.capture.points.points, one.capture.points.points)
-    fewer = PointmapOptions(samples=300, iterations=20, max_points=900)
+    fewer = PointmapOptions(max_points=900)
     three = recover_from_pointmaps(photographs, source, folder=kept, options=fewer)
     assert not three.reused
     assert three.report.points == 900
@@ -95,7 +103,7 @@ def test_a_network_is_asked_once_for_each_pair(tmp_path, photographed) -> None:
     photographs = photographed.write(tmp_path / "photos")
     network = Network(photographed, photographed.answers(complete(8)))
     assert isinstance(network, PointmapModel)
-    options = PointmapOptions(samples=300, iterations=5, max_points=900, pairs="window", window=2)
+    options = PointmapOptions(max_points=900, pairs="window", window=2)
     kept = tmp_path / "capture"
     found = recover_from_pointmaps(photographs, network, folder=kept, options=options)
     assert len(network.asked) == len(set(network.asked)) == found.report.pairs == 26
@@ -114,31 +122,24 @@ def test_pairs_are_chosen_as_asked(tmp_path, photographed) -> None:
     photographs = photographed.write(tmp_path / "photos")
     source = photographed.record(tmp_path / "maps", complete(8))
     for name, count in (("reference", 14), ("window", 12), ("complete", 56)):
-        options = PointmapOptions(
-            samples=100, iterations=2, max_points=100, pairs=name, window=1
-        )  # fmt: skip
+        options = PointmapOptions(max_points=100, pairs=name, window=1)
         wanted = 14 if name == "window" else count
         found = recover_from_pointmaps(photographs, source, options=options)
         assert found.report.pairs == wanted
 
 
 def test_a_network_is_asked_about_all_pairs_or_about_those_that_look_alike(
-    tmp_path, photographed
+    tmp_path, photographed, monkeypatch
 ) -> None:
     photographs = photographed.write(tmp_path / "photos")
     for complete_up_to, neighbours, pairs in ((8, 1, 56), (7, 1, 14)):
         network = Network(photographed, photographed.answers(complete(8)))
-        options = PointmapOptions(
-            samples=100, iterations=2, max_points=100,
-            complete_up_to=complete_up_to, neighbours=neighbours,
-        )  # fmt: skip
+        monkeypatch.setattr(_pointmap_pixels, "_COMPLETE_UP_TO", complete_up_to)
+        monkeypatch.setattr(_pointmap_pixels, "_NEIGHBOURS", neighbours)
+        options = PointmapOptions(max_points=100)
         found = recover_from_pointmaps(photographs, network, options=options)
         # Shades without a feature look like nothing: each with the next by name is left.
         assert found.report.pairs == len(network.asked) == pairs
-    one_way = PointmapOptions(
-        samples=100, iterations=2, max_points=100, pairs="complete", symmetric=False
-    )
-    assert recover_from_pointmaps(photographs, network, options=one_way).report.pairs == 28
 
 
 def test_pairs_that_are_missing_are_named(tmp_path, photographed) -> None:

@@ -7,10 +7,9 @@ import torch
 from splatseg.core import Camera, ClassInfo, ClassTable, LabelMap, View
 from splatseg.io.evidence import Evidence, create_evidence, open_evidence, save_label_map
 from splatseg.street.hits import MeshCaster
-from splatseg.street.mesh import PrimitiveMesh
+from splatseg.street.primitives import PrimitiveMesh
 from splatseg.street.radiance import RadianceOptions
-from splatseg.street.shapes import template
-from splatseg.street.shapes.template import FACES
+from splatseg.street.shapes import FACES, template
 
 WIDTH, HEIGHT = 12, 8
 RED, GREEN, SKY = 4, 7, 9

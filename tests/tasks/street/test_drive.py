@@ -14,10 +14,11 @@ from splatseg.core import Renderable, Scene
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.io.scans import read_scans
 from splatseg.io.scene import scene_field_names
-from splatseg.street.blocks import DriveBlockOptions, DriveField, load_drive
-from splatseg.street.blocks.line import distances
+from splatseg.street.block_field import DriveField
+from splatseg.street.blocks import DriveBlockOptions, distances
+from splatseg.street.build import DnmpOptions
 from splatseg.street.field import MeshField
-from splatseg.street.options import DnmpOptions
+from splatseg.street.files import load_drive
 from splatseg.tasks import (
     ScanLabelOptions,
     StreetDrive,

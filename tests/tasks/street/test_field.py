@@ -13,8 +13,7 @@ from splatseg.errors import InputError
 from splatseg.io.evidence import create_evidence
 from splatseg.io.scans import read_scans
 from splatseg.io.scene import scene_field_names
-from splatseg.street.build import seen_shares
-from splatseg.street.options import DnmpOptions
+from splatseg.street.build import DnmpOptions, seen_shares
 from splatseg.tasks import (
     EvaluationOptions,
     RenderingOptions,

@@ -18,8 +18,8 @@ from splatseg.io.evidence import open_evidence
 from splatseg.io.images import load_mask
 from splatseg.io.moving import write_moving
 from splatseg.io.scans import read_scans
-from splatseg.street.geometry import DepthView
-from splatseg.street.options import DnmpOptions
+from splatseg.street.build import DnmpOptions
+from splatseg.street.depth_views import DepthView
 from splatseg.tasks import StreetDrive, StreetOptions, make_street_field, open_drive, street_field
 from splatseg.tasks.street._inputs import drive_inputs
 from splatseg.tasks.street._masks import masked_depths, masked_depths_of

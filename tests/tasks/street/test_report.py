@@ -15,9 +15,9 @@ from splatseg.core import Camera, ClassInfo, ClassTable, LayerInfo, RenderableLa
 from splatseg.errors import InputError
 from splatseg.io.scans import read_scans
 from splatseg.report.maps import LabelledPoints
+from splatseg.street.build import DnmpOptions
+from splatseg.street.depth_views import DepthView
 from splatseg.street.field import MeshField
-from splatseg.street.geometry import DepthView
-from splatseg.street.options import DnmpOptions
 from splatseg.tasks import ScanLabelOptions, StreetOptions, label_scans, open_drive, street_field
 from splatseg.tasks.street._depths import KeptDepths, depth_errors, spread_views
 from splatseg.tasks.street.point_scores import in_sight, point_scores, true_ids

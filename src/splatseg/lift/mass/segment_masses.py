@@ -26,7 +26,7 @@ from splatseg.core import Camera, Gaussians, LabelMap, MaskSet
 from splatseg.errors import ShapeError
 from splatseg.lift.mass.pieces import Pieces, covered_pieces, pieces_of
 from splatseg.lift.mass.products import entries_of, sparse_product
-from splatseg.render import ImageWeights, RenderOptions, SparseWeights, options_for, weights
+from splatseg.render import RenderOptions, SparseWeights, image_weights, options_for, weights
 from splatseg.render.warp import undistorted_camera, warp_into_photograph
 
 _BAND = 1 << 19
@@ -170,9 +170,7 @@ def _image_sums(
     """The sums of a whole image, one band: the faster way, without rows of pixels."""
     import scipy.sparse
 
-    image = weights(gaussians, camera, layout="blocks", options=options, backend=backend)
-    if not isinstance(image, ImageWeights):
-        raise TypeError(f"weights: expected those of an image, got {type(image).__name__}.")
+    image = image_weights(gaussians, camera, options=options, backend=backend)
     found: list[list[Any]] = []
     for pieces in runs:
         sums = image.part_sums(torch.from_numpy(pieces.piece).to(gaussians.device))

@@ -7,9 +7,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatseg.core import ScanSource, View
-from splatseg.street.blocks import Drive, DriveBlock, DriveScans, block_file, block_views
+from splatseg.street.block_field import DriveScans, block_views
+from splatseg.street.blocks import DriveBlock, DriveBlocks
 from splatseg.street.field import MeshField
-from splatseg.street.files import load_mesh_field
+from splatseg.street.files import block_file, load_mesh_field
 from splatseg.tasks._observer import Observer
 from splatseg.tasks.street._build import FieldBuilder
 from splatseg.tasks.street._identity import DigestedScans
@@ -35,7 +36,7 @@ class BlockParts:
 
     def __init__(
         self,
-        drive: Drive,
+        drive: DriveBlocks,
         inputs: DriveInputs,
         *,
         views: tuple[View, ...],

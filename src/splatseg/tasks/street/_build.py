@@ -12,9 +12,14 @@ from torch import Tensor
 
 from splatseg.core import ScanSource, Scene, View
 from splatseg.render import BackendName
-from splatseg.street.build import MeshFieldFit, build_mesh_field
+from splatseg.street.build import (
+    PUBLISHED,
+    DnmpOptions,
+    MeshFieldFit,
+    MeshFieldInputs,
+    build_mesh_field,
+)
 from splatseg.street.field import MeshField
-from splatseg.street.options import PUBLISHED, DnmpOptions
 from splatseg.tasks._observer import Observer
 from splatseg.tasks.scene_parts import views_recorded
 from splatseg.tasks.street._depths import DepthSample, KeptDepths
@@ -108,14 +113,16 @@ class FieldBuilder:
         depths = KeptDepths(sources.depths(), views)
         with _Stages(observer, self._took) as stages:
             made = build_mesh_field(
-                cloud,
-                depths,
-                views,
-                inputs.evidence,
+                MeshFieldInputs(
+                    points=cloud,
+                    depths=depths,
+                    views=views,
+                    evidence=inputs.evidence,
+                    classes=inputs.evidence.classes or self._scene.classes,
+                    metres_per_unit=inputs.metres,
+                ),
                 options=self.chosen,
                 layer=self.layer,
-                classes=inputs.evidence.classes or self._scene.classes,
-                metres_per_unit=inputs.metres,
                 seed=self._options.seed,
                 progress=stages.told,
             )

@@ -9,8 +9,9 @@ from torch import Tensor
 
 from splatseg.core import View
 from splatseg.report.street_report import DepthError
-from splatseg.street.geometry import DepthView, PrimitiveCaster, distances_of
-from splatseg.street.mesh import PrimitiveMesh
+from splatseg.street.depth_views import DepthView, distances_of
+from splatseg.street.hits import PrimitiveCaster
+from splatseg.street.primitives import PrimitiveMesh
 
 _VIEWS = 6
 _RAYS = 20_000

@@ -12,7 +12,7 @@ from splatseg.core import Scan, ScanSource, Scene
 from splatseg.io.digests import camera_numbers, digest, file_mark
 from splatseg.io.evidence import DepthEvidence, LabelEvidence, find_evidence, open_evidence
 from splatseg.io.tables import class_rows
-from splatseg.street.options import DnmpOptions
+from splatseg.street.build import DnmpOptions
 from splatseg.tasks.street._build import versions
 from splatseg.tasks.street._inputs import DriveInputs
 from splatseg.tasks.street._sources import DEPTHS

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 from splatseg.core import View
 from splatseg.io.images import left_out_pixels
-from splatseg.street.geometry import DepthView
+from splatseg.street.depth_views import DepthView
 
 
 def masked_depths(views: Sequence[View], depths: Iterable[DepthView]) -> Iterator[DepthView]:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from splatseg.errors import InputError
 from splatseg.io.scene import scene_field_names, scene_field_path
-from splatseg.street.blocks import missing_blocks
+from splatseg.street.files import missing_blocks
 
 
 def check_field_name(root: Path, name: str, *, in_blocks: bool) -> None:

@@ -15,7 +15,7 @@ from splatseg.io.captures import find_formats, read_capture
 from splatseg.io.evidence import DepthEvidence, find_evidence, open_evidence
 from splatseg.lift import GaussianField
 from splatseg.render import BackendName
-from splatseg.street.geometry import (
+from splatseg.street.depth_views import (
     DepthView,
     capture_views,
     evidence_views,
@@ -24,7 +24,7 @@ from splatseg.street.geometry import (
     point_views,
     scan_views,
 )
-from splatseg.street.sources import depth_points, gaussian_points, scan_points
+from splatseg.street.method import depth_points, gaussian_points, scan_points
 from splatseg.tasks.street._masks import masked_depths, masked_depths_of
 
 DEPTHS = ("auto", "scans", "scans+gaussians", "maps", "gaussians", "points")

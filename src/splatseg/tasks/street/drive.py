@@ -19,18 +19,16 @@ from splatseg.io.scene import (
 )
 from splatseg.io.scene_folder import work_on_scene
 from splatseg.render import BackendName
-from splatseg.street.blocks import (
-    Drive,
-    DriveField,
+from splatseg.street.block_field import DriveField
+from splatseg.street.blocks import DriveBlocks, cut_drive, frame_centres
+from splatseg.street.build import DnmpOptions
+from splatseg.street.files import (
     build_blocks,
-    cut_drive,
     drive_about,
-    frame_centres,
     goes_on,
     missing_blocks,
     open_blocks,
 )
-from splatseg.street.options import DnmpOptions
 from splatseg.tasks._moving import LeftOut
 from splatseg.tasks._observer import SILENT, Observer
 from splatseg.tasks.street._blocks import BlockParts
@@ -172,7 +170,7 @@ def street_drive(
 
 def _begun(
     root: Path,
-    drive: Drive,
+    drive: DriveBlocks,
     parts: BlockParts,
     name: str,
     about: Mapping[str, Any],
@@ -202,7 +200,11 @@ def _of_others(folder: Path, about: Mapping[str, Any]) -> str:
 
 
 def _build(
-    drive: Drive, folder: Path, parts: BlockParts, about: Mapping[str, Any], observer: Observer
+    drive: DriveBlocks,
+    folder: Path,
+    parts: BlockParts,
+    about: Mapping[str, Any],
+    observer: Observer,
 ) -> None:
     """Make the blocks that lack; who interrupts it is told how to go on."""
     if (folder / DRIVE_FILE).is_file():

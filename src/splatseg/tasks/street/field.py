@@ -16,10 +16,9 @@ from splatseg.io.evidence import Evidence
 from splatseg.io.scene import load_scene, new_field_file, remove_field_folder, save_scene
 from splatseg.io.scene_folder import is_scene, scene_lock
 from splatseg.render import BackendName
-from splatseg.street.build import MeshFieldFit
+from splatseg.street.build import DnmpOptions, MeshFieldFit
 from splatseg.street.field import MeshField
 from splatseg.street.files import save_mesh_field
-from splatseg.street.options import DnmpOptions
 from splatseg.tasks._moving import LeftOut
 from splatseg.tasks._observer import SILENT, Observer
 from splatseg.tasks.new_scene import check_new_folder

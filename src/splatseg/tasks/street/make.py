@@ -6,7 +6,7 @@ from splatseg.errors import InputError
 from splatseg.io.scene import FOLDER, scene_field_names, scene_field_path
 from splatseg.io.scene_folder import work_on_scene
 from splatseg.render import BackendName
-from splatseg.street.options import DnmpOptions
+from splatseg.street.build import DnmpOptions
 from splatseg.tasks._observer import SILENT, Observer
 from splatseg.tasks.scene_parts import scene_field
 from splatseg.tasks.street._build import chosen_options
@@ -101,5 +101,5 @@ def made_street_field(
         return None
     chosen = chosen_options(options, field_options)
     default = chosen.vertex_rule is None and chosen.setting == "fast"
-    rule = None if default else chosen.asked_vertices
+    rule = None if default else chosen.effective_vertex_rule
     return scene_field(scene, options.field, vertex_rule=rule)

@@ -20,7 +20,7 @@ from splatseg.evaluate import Confusion, semantic_score, street_class
 from splatseg.io.depths import depth_kind
 from splatseg.lift.points import points_in_sight
 from splatseg.report.street_report import PointScore
-from splatseg.street.geometry import DepthView, capture_views, field_views
+from splatseg.street.depth_views import DepthView, capture_views, field_views
 
 
 @boundary

@@ -28,8 +28,8 @@ from splatseg.report.street_report import (
 )
 from splatseg.report.words import count_text
 from splatseg.street.field import VERTEX_WORDS
-from splatseg.street.geometry import enclosing
-from splatseg.street.shapes import load_shapes
+from splatseg.street.hits import enclosing
+from splatseg.street.shape_files import load_shapes
 from splatseg.tasks.outputs import REPORTS_FOLDER
 from splatseg.tasks.scan_labels import LabelBy, ScanLabels
 from splatseg.tasks.street._depths import depth_errors, spread_views

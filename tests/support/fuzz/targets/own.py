@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,7 @@ from splatseg.core import (
     VoxelFeatures,
     VoxelGrid,
 )
-from splatseg.fit._checkpoint import Checkpoint, read_checkpoint, write_checkpoint
-from splatseg.fit._state import FitState
+from splatseg.fit._checkpoint import FitState, read_checkpoint, write_checkpoint
 from splatseg.io.export import column_table_of, write_column_table
 from splatseg.io.layers import load_layer, save_layer
 from splatseg.io.moving import read_moving
@@ -29,11 +29,10 @@ from splatseg.io.scene import load_scene, save_scene
 from splatseg.io.tensors import read_tensors
 from splatseg.lift.training import _state as training
 from splatseg.pose import _saved as saved
-from splatseg.pose._report import LeftOut, Lens, MapperTry, PoseReport
-from splatseg.street.blocks import DriveBlockOptions, cut_drive, load_drive, save_drive
-from splatseg.street.files import load_mesh_field, save_mesh_field
-from splatseg.street.hits import MeshCaster
-from splatseg.street.radiance.cache import cached_hits, read_hits
+from splatseg.pose._photographs import LeftOut
+from splatseg.pose._saved import Lens, MapperTry, PoseReport
+from splatseg.street.blocks import DriveBlockOptions, cut_drive
+from splatseg.street.files import load_drive, load_mesh_field, save_drive, save_mesh_field
 from splatseg.tasks._figures import read_points, read_scores
 from support.fuzz.targets.base import (
     Target,
@@ -136,20 +135,6 @@ def drive_in_blocks(folder: Path) -> Target:
     return Target(file=file, read=lambda: load_drive(file))
 
 
-def _hits(name: str) -> None:
-    @target(f"hits-{name}")
-    def make(folder: Path) -> Target:
-        kept, file = folder / "hits", folder / "hits" / name
-        directions = torch.tensor([[x / 40, 0.01, 1.0] for x in range(-9, 10)])
-        hits = MeshCaster(balls([[0, 0, 2]])).hits(torch.zeros(3), directions, max_hits=4)
-        cached_hits([hits], memory=0, folder=kept, triangles=80, identity="a")
-        return Target(file=file, read=lambda: read_hits(kept, triangles=80, identity="a"))
-
-
-for _name in ("cache.json", "counts.bin", "faces.bin", "weights.bin"):
-    _hits(_name)
-
-
 @target("safetensors")
 def safetensors(folder: Path) -> Target:
     """Weights."""
@@ -172,8 +157,8 @@ def fit_checkpoint(folder: Path) -> Target:
     """A fit that was stopped."""
     file = folder / "checkpoint.npz"
     content = {"steps": 3, "progress": 0.5, "seconds": 1.0, "gaussians": 4}
-    state = FitState(tensors={"a/b": torch.ones(3)}, content=content)
-    write_checkpoint(Checkpoint(state=state, identity={"data": {}}), file)
+    state = FitState(tensors={"a/b": torch.ones(3)}, content=content, identity={"data": {}})
+    write_checkpoint(state, file)
     return Target(file=file, read=lambda: read_checkpoint(file))
 
 
@@ -214,7 +199,7 @@ def poses(folder: Path) -> Target:
         seconds={"match": 1.5},
     )
     content = {"format": saved.FORMAT, "version": saved.VERSION, "made_of": "x"}
-    (folder / saved.FILE).write_text(json.dumps(content | {"report": made.as_json()}))
+    (folder / saved.FILE).write_text(json.dumps(content | {"report": asdict(made)}))
     return Target(
         file=folder / saved.FILE, read=lambda: saved.load_pose_report(folder, made_of="x")
     )

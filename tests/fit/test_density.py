@@ -1,0 +1,325 @@
+"""Density control: relocation, and cloning, splitting and pruning."""
+
+import math
+
+import pytest
+import torch
+
+from splatseg.core import Camera
+from splatseg.fit import FitOptions
+from splatseg.fit._density import (
+    DefaultStrategy,
+    ScreenStatistics,
+    densified,
+    relocated,
+    shared_shape,
+    with_reset_opacities,
+)
+from splatseg.fit._parameters import Parameters
+
+
+def _parameters(opacities: list[float]) -> Parameters:
+    count = len(opacities)
+    generator = torch.Generator().manual_seed(3)
+    return Parameters(
+        means=torch.randn(count, 3, generator=generator),
+        log_scales=torch.randn(count, 3, generator=generator),
+        rotations=torch.randn(count, 4, generator=generator),
+        logits=torch.tensor(opacities).logit()[:, None],
+        sh=torch.randn(count, 12, generator=generator),
+    )
+
+
+def _ones(parameters: Parameters) -> Parameters:
+    return Parameters(**{n: torch.ones_like(t) for n, t in parameters.tensors()})
+
+
+def _relocated(
+    parameters: Parameters, count: int, seed: int = 0
+) -> tuple[Parameters, Parameters, Parameters]:
+    return relocated(
+        parameters,
+        _ones(parameters),
+        _ones(parameters),
+        count=count,
+        generator=torch.Generator().manual_seed(seed),
+    )
+
+
+@pytest.mark.parametrize("copies", [1, 2, 3, 7, 20, 51])
+@pytest.mark.parametrize("opacity", [0.01, 0.3, 0.9, 0.999])
+def test_copies_blend_to_the_one_they_replace(opacity: float, copies: int) -> None:
+    """At the centre, and integrated over the line: 1 - (1 - o' g)^N against o g."""
+    shared, factor = shared_shape(
+        torch.tensor([opacity], dtype=torch.float64), torch.tensor([copies])
+    )
+    assert 1 - (1 - float(shared)) ** copies == pytest.approx(opacity, rel=1e-6)
+    x = torch.linspace(-12, 12, 100_001, dtype=torch.float64)
+    bell = torch.exp(-0.5 * (x / float(factor)) ** 2)
+    blended = torch.trapezoid(1 - (1 - float(shared) * bell) ** copies, x)
+    alone = torch.trapezoid(opacity * torch.exp(-0.5 * x**2), x)
+    assert float(blended) == pytest.approx(float(alone), rel=1e-5)
+
+
+def test_one_copy_is_unchanged() -> None:
+    shared, factor = shared_shape(torch.tensor([0.4]), torch.tensor([1]))
+    torch.testing.assert_close((shared, factor), (torch.tensor([0.4]), torch.tensor([1.0])))
+
+
+def test_dead_gaussians_go_to_living_ones() -> None:
+    before = _parameters([0.8, 0.001, 0.004, 0.003])
+    after, first, second = _relocated(before, count=4)
+    assert len(after) == 4
+    for name in ("means", "rotations", "sh"):
+        tensor, old = getattr(after, name), getattr(before, name)
+        assert torch.equal(tensor, old[:1].expand(4, -1))
+    shared, factor = shared_shape(torch.tensor([0.8]), torch.tensor([4]))
+    torch.testing.assert_close(after.logits.sigmoid(), shared.expand(4)[:, None])
+    torch.testing.assert_close(after.log_scales, before.log_scales[:1].expand(4, -1) + factor.log())
+    for moment in (first, second):
+        assert all(not bool(tensor.any()) for _, tensor in moment.tensors())
+
+
+def test_new_gaussians_come_beside_opaque_ones() -> None:
+    opacities = [0.9] * 10 + [0.01] * 90
+    before = _parameters(opacities)
+    after, _, _ = _relocated(before, count=1000)
+    assert len(after) == 150  # half as many more at once
+    added = after.means[100:]
+    exact = "donot_use_mm_for_euclid_dist"
+    distance = torch.cdist(added, before.means, compute_mode=exact)
+    assert float(distance.amin(dim=1).max()) == 0.0
+    # Nine of 9.9 parts of the opacity are in the first ten: most copies come from there.
+    assert int((distance.argmin(dim=1) < 10).sum()) >= 38
+
+
+def test_moments_of_the_untouched_stay() -> None:
+    before = _parameters([0.5] * 40 + [0.001])
+    after, first, _ = _relocated(before, count=41)
+    changed = (after.logits[:40] != before.logits[:40]).squeeze(1)
+    assert int(changed.sum()) == 1
+    assert torch.equal((first.means[:40] == 0).all(dim=1), changed)
+    assert torch.equal(after.means[:40], before.means[:40])
+
+
+def test_nothing_given_is_changed() -> None:
+    before = _parameters([0.5, 0.001, 0.7])
+    kept = {name: tensor.clone() for name, tensor in before.tensors()}
+    _relocated(before, count=5)
+    for name, tensor in before.tensors():
+        assert torch.equal(tensor, kept[name])
+
+
+def test_nothing_to_do_is_nothing_done() -> None:
+    alive, dead = _parameters([0.5, 0.7]), _parameters([0.001, 0.002])
+    assert _relocated(alive, count=1)[0] is alive
+    assert _relocated(dead, count=9)[0] is dead
+
+
+def test_same_seed_same_places() -> None:
+    before = _parameters([0.5] * 30)
+    one, same, other = (_relocated(before, count=37, seed=s)[0].means for s in (4, 4, 5))
+    assert torch.equal(one, same)
+    assert not torch.equal(one, other)
+
+
+# Classic densification: each rule on a scene of a few Gaussians.
+
+
+EXTENT = 10.0
+OPTIONS = FitOptions(strategy="classic", densify_gradient=0.1)
+"""Cloned up to a scale of 0.1, split above; dropped above a scale of 1."""
+
+
+def _balls(scales, opacities=None) -> Parameters:
+    """Balls of these scales beside each other, with an opacity of 0.5 by default."""
+    count = len(scales)
+    opacities = torch.full((count,), 0.5) if opacities is None else torch.tensor(opacities)
+    rotations = torch.zeros(count, 4)
+    rotations[:, 0] = 2.0
+    return Parameters(
+        means=torch.arange(3.0 * count).view(count, 3),
+        log_scales=torch.tensor(scales).log()[:, None].repeat(1, 3),
+        rotations=rotations,
+        logits=opacities.logit()[:, None],
+        sh=torch.arange(3.0 * count).view(count, 3) / 10,
+    )
+
+
+def _moments(like: Parameters) -> tuple[Parameters, Parameters]:
+    """No row is 0, so that a moment that was kept is distinguished from a fresh one."""
+    ones = Parameters(**{name: torch.ones_like(tensor) for name, tensor in like.tensors()})
+    return ones, ones.rows(torch.arange(len(ones)))
+
+
+def _statistics(per_view, views=None, radii=None) -> ScreenStatistics:
+    views = [1.0] * len(per_view) if views is None else views
+    radii = [0.0] * len(per_view) if radii is None else radii
+    return ScreenStatistics(
+        gradients=torch.tensor(per_view), views=torch.tensor(views), radii=torch.tensor(radii)
+    )
+
+
+def _round(parameters, statistics, *, prune_large=False, options=OPTIONS, seed=0):
+    return densified(
+        parameters,
+        *_moments(parameters),
+        statistics,
+        options=options,
+        extent=EXTENT,
+        prune_large=prune_large,
+        generator=torch.Generator().manual_seed(seed),
+    )
+
+
+def test_a_small_one_that_is_pulled_is_doubled_in_place():
+    start = _balls([0.1, 0.1])
+    grown, first, _ = _round(start, _statistics([0.1, 0.0999]))
+    assert len(grown) == 3
+    for name, tensor in grown.tensors():
+        assert torch.equal(tensor[:2], dict(start.tensors())[name]), name
+        assert torch.equal(tensor[2], dict(start.tensors())[name][0]), name
+    assert first.means.tolist() == [[1, 1, 1], [1, 1, 1], [0, 0, 0]]
+
+
+def test_a_large_one_that_is_pulled_becomes_two_smaller_ones_drawn_from_it():
+    start = _balls([0.101] * 2000)
+    grown, first, second = _round(start, _statistics([1.0] * 2000))
+    assert len(grown) == 4000
+    torch.testing.assert_close(
+        grown.log_scales.exp(), torch.full((4000, 3), 0.101 / 1.6), rtol=1e-5, atol=0
+    )
+    steps = grown.means - start.means.repeat(2, 1)
+    assert steps.std(dim=0).tolist() == pytest.approx([0.101] * 3, rel=0.05)
+    assert steps.mean(dim=0).abs().max() < 0.01
+    assert torch.equal(grown.sh, start.sh.repeat(2, 1))
+    assert not first.means.any()
+    assert not second.means.any()
+
+
+def test_it_is_drawn_along_its_own_axes():
+    start = _balls([0.2] * 3000)
+    # A quarter turn about z: the second axis, the long one, points along -x.
+    start = start.replaced(
+        rotations=torch.tensor([[math.cos(math.pi / 4), 0, 0, math.sin(math.pi / 4)]]).repeat(
+            3000, 1
+        ),
+        log_scales=torch.tensor([[0.2, 2.0, 0.02]]).log().repeat(3000, 1),
+    )
+    grown, _, _ = _round(start, _statistics([1.0] * 3000))
+    steps = grown.means - start.means.repeat(2, 1)
+    assert steps.std(dim=0).tolist() == pytest.approx([2.0, 0.2, 0.02], rel=0.05)
+
+
+def test_the_mean_over_the_views_that_had_it_in_sight_decides():
+    start = _balls([0.1, 0.1, 0.1])
+    grown, _, _ = _round(start, _statistics([0.3, 0.3, 0.0], views=[3.0, 4.0, 0.0]))
+    assert len(grown) == 4
+    assert torch.equal(grown.means[3], start.means[0])
+
+
+def test_where_there_is_no_room_for_all_the_steepest_come_first():
+    options = FitOptions(strategy="classic", densify_gradient=0.1, max_gaussians=4)
+    start = _balls([0.1, 0.1, 0.1])
+    grown, _, _ = _round(start, _statistics([0.2, 0.4, 0.3]), options=options)
+    assert grown.means.tolist() == [*start.means.tolist(), start.means[1].tolist()]
+
+
+def test_the_faint_are_dropped_and_the_rest_keep_their_moments():
+    start = _balls([0.1, 0.1, 0.1], opacities=[0.0049, 0.0051, 0.5])
+    grown, first, _ = _round(start, _statistics([0.0] * 3))
+    assert torch.equal(grown.means, start.means[1:])
+    assert first.means.tolist() == [[1, 1, 1], [1, 1, 1]]
+
+
+def test_large_ones_are_dropped_after_the_first_reset_only():
+    start = _balls([1.01, 0.99, 0.1, 0.1])
+    statistics = _statistics([0.0] * 4, radii=[0.0, 0.0, 20.1, 19.9])
+    assert len(_round(start, statistics)[0]) == 4
+    grown, _, _ = _round(start, statistics, prune_large=True)
+    assert torch.equal(grown.means, start.means[[1, 3]])
+
+
+def test_a_scene_is_never_emptied():
+    start = _balls([0.1, 0.1], opacities=[0.001, 0.001])
+    assert len(_round(start, _statistics([0.0, 0.0]))[0]) == 2
+
+
+def test_a_reset_lowers_opacities_and_forgets_their_moments():
+    start = _balls([0.1, 0.1], opacities=[0.008, 0.9])
+    reset, first, second = with_reset_opacities(start, *_moments(start))
+    assert reset.logits.sigmoid().squeeze(1).tolist() == pytest.approx([0.008, 0.01])
+    assert start.logits.sigmoid()[1] == pytest.approx(0.9)
+    for moment in (first, second):
+        assert not moment.logits.any()
+        assert moment.means.all()
+
+
+def test_gradients_are_in_half_image_sides_and_radii_three_standard_deviations():
+    statistics = ScreenStatistics.zeros(3, torch.device("cpu"))
+    camera = Camera(
+        width=200, height=100, fx=80.0, fy=50.0, cx=100, cy=50, cam_from_world=torch.eye(4).double()
+    )
+    parameters = _balls([0.5, 0.5, 0.25]).replaced(
+        means=torch.tensor([[0.0, 0, 4], [0, 0, 2], [0, 0, 8]])
+    )
+    rows = torch.tensor([0, 2])
+    per_view = torch.tensor([[0.03, 0.0], [0.0, 0.04]])
+    statistics.add(rows, per_view, camera=camera, parameters=parameters)
+    statistics.add(rows[:1], per_view[:1], camera=camera, parameters=parameters)
+    assert statistics.gradients.tolist() == pytest.approx([6.0, 0.0, 2.0])
+    assert statistics.views.tolist() == [2, 0, 1]
+    # 3 * 80 * 0.5 / 4 and 3 * 80 * 0.25 / 8
+    assert statistics.radii.tolist() == pytest.approx([30.0, 0.0, 7.5])
+
+
+def test_when_rounds_and_resets_come():
+    """A faint one stays until a round, an opaque one until a reset; both end half-way."""
+    options = FitOptions(
+        strategy="classic",
+        steps=100,
+        minutes=None,
+        densify_from=20,
+        densify_every=10,
+        densify_until=0.5,
+        reset_every=15,
+    )
+    generator = torch.Generator().manual_seed(0)
+
+    def after(steps):
+        classic = DefaultStrategy(options, start=2, extent=EXTENT, device=torch.device("cpu"))
+        start = _balls([0.1, 0.1], opacities=[0.001, 0.9])
+        state = (start, *_moments(start))
+        found, _, _ = classic.after_step(
+            state, steps=steps, progress=(steps - 1) / 100, generator=generator
+        )
+        return len(found), float(found.logits.sigmoid().max())
+
+    assert after(10) == (2, pytest.approx(0.9))
+    assert after(20) == (1, pytest.approx(0.9))
+    assert after(14) == (2, pytest.approx(0.9))
+    assert after(15) == (2, pytest.approx(0.01))
+    assert after(30) == (1, pytest.approx(0.01))
+    assert after(50) == (1, pytest.approx(0.9))
+    assert after(60) == (2, pytest.approx(0.9))
+    assert after(75) == (2, pytest.approx(0.9))
+
+
+def test_statistics_go_on_after_a_restore():
+    options = FitOptions(strategy="classic", steps=100, minutes=None, reset_every=41)
+    one = DefaultStrategy(options, start=2, extent=EXTENT, device=torch.device("cpu"))
+    start = _balls([0.1, 0.1])
+    state = one.after_step(
+        (start, *_moments(start)), steps=41, progress=0.4, generator=torch.Generator()
+    )
+    camera = Camera(
+        width=2, height=2, fx=1.0, fy=1.0, cx=1, cy=1, cam_from_world=torch.eye(4).double()
+    )
+    one.add_view(torch.tensor([1]), torch.ones(1, 2), camera=camera, parameters=state[0])
+    other = DefaultStrategy(options, start=2, extent=EXTENT, device=torch.device("cpu"))
+    other.restore(one.state())
+    assert other.state().keys() == {"gradients", "views", "radii", "resets"}
+    for name, tensor in one.state().items():
+        assert torch.equal(tensor, other.state()[name]), name
+    assert int(other.state()["resets"]) == 1
+    assert other.state()["gradients"].tolist() == pytest.approx([0.0, 2**0.5])
