@@ -26,8 +26,7 @@ from splatseg.core import Selection
 from splatseg.io.evidence import open_evidence
 from splatseg.io.scene import load_scene
 from splatseg.lift import uplift
-from splatseg.prompting.graph import NeighbourGraph, build_graph
-from splatseg.prompting.holes import holes, specks
+from splatseg.prompting.graph import NeighbourGraph, build_graph, holes, specks
 from splatseg.prompting.next_click import next_click
 from splatseg.prompting.refine import refine
 from splatseg.render.cpu import set_threads

@@ -31,8 +31,14 @@ from torch import Tensor
 from splatseg import _native
 from splatseg.io.scene import load_scene
 from splatseg.neighbours import NeighbourIndex, Subset
-from splatseg.prompting.filtering import FilterOptions, statistical_filter
-from splatseg.prompting.growing import GrowOptions, ball_grow, growth_radius, region_grow
+from splatseg.prompting.pipeline import (
+    FilterOptions,
+    GrowOptions,
+    ball_grow,
+    growth_radius,
+    region_grow,
+    statistical_filter,
+)
 from splatseg.prompting.retrieval import StoredFeatures, mean_threshold, retrieve, scores
 
 CHANNELS = 32

@@ -1,7 +1,7 @@
 """Classes out of a network's configuration."""
 
 from splatseg.io.label_tables import label_table
-from splatseg.models._class_names import network_classes
+from splatseg.models.networks.segmenters import network_classes
 
 
 def names_of(table: str) -> dict[str, str]:

@@ -10,7 +10,7 @@ from PIL import Image as Picture
 from splatseg.core import DepthMap
 from splatseg.errors import FileFormatError, InputError, ShapeError
 from splatseg.io.evidence import open_evidence, save_depth_map, save_label_map
-from splatseg.models import ModelCache, record_evidence, recorded_model
+from splatseg.models import EvidenceRequest, ModelCache, record_evidence, recorded_model
 from splatseg.models.recorded import RecordedDepth
 
 
@@ -36,7 +36,7 @@ def test_it_is_written_and_gone_on_with(views, tmp_path) -> None:
     seen = record_evidence(model, views[:2], tmp_path / "e")
     assert (seen.kind, seen.views, seen.masks) == ("depth", 2, None)
     (tmp_path / "e" / "v1.npz").write_bytes(b"half")
-    record_evidence(model, views, tmp_path / "e", what="depth")
+    record_evidence(model, views, tmp_path / "e", EvidenceRequest(what="depth"))
     assert model.asked == 4, "the damaged and the new view"
     evidence = open_evidence(tmp_path / "e")
     assert evidence.view_names == ("v0", "v1", "v2")
@@ -60,7 +60,7 @@ def test_a_cache_keeps_it_as_evidence_does(tmp_path, rng, sure, precision) -> No
     image = torch.from_numpy(rng.integers(0, 256, (9, 7, 3)).astype("uint8"))
     model = Near(sure=sure)
     cache = ModelCache(folder=tmp_path / "cache", precision=precision)
-    first, second = (cache.depth_map(model, image) for _ in range(2))
+    first, second = (cache.ask("depth", model, image) for _ in range(2))
     assert model.asked == 1
     direct = Near(sure=sure).depth_map(image)
     for found in (first, second):
@@ -81,7 +81,7 @@ def test_recorded_maps_are_copied_at_their_own_size(views, tmp_path) -> None:
         save_depth_map(given, tmp_path / "there", view.name)
     model = recorded_model(tmp_path / "there", views=views)
     assert isinstance(model, RecordedDepth)
-    seen = record_evidence(model, views, tmp_path / "e", what="depth")
+    seen = record_evidence(model, views, tmp_path / "e", EvidenceRequest(what="depth"))
     assert seen.notes == ("1 views have no depth at all (v0).",)
     found = open_evidence(tmp_path / "e").depth_map("v2")
     assert (found.height, found.width, found.kind) == (24, 32, "metric")
@@ -91,7 +91,7 @@ def test_recorded_maps_are_copied_at_their_own_size(views, tmp_path) -> None:
 
     assert model.depth_map(load_image(views[1])).values.unique().tolist() == [1]
     with pytest.raises(InputError, match="expected evidence of masks, got depth"):
-        record_evidence(model, views, tmp_path / "f", what="masks")
+        record_evidence(model, views, tmp_path / "f", EvidenceRequest(what="masks"))
 
 
 def test_pictures_of_others_with_and_without_a_unit(views, tmp_path) -> None:
@@ -124,5 +124,8 @@ def test_what_is_refused(views, tmp_path) -> None:
     save_label_map(LabelMap(ids=torch.ones(48, 64)), tmp_path / "labels", "v0")
     with pytest.raises(InputError, match="expected evidence of depth, got labels"):
         record_evidence(
-            recorded_model(tmp_path / "labels"), views[:1], tmp_path / "g", what="depth"
+            recorded_model(tmp_path / "labels"),
+            views[:1],
+            tmp_path / "g",
+            EvidenceRequest(what="depth"),
         )

@@ -12,7 +12,7 @@ from splatseg.core import FeatureMap
 from splatseg.core.models import DeepFeatures
 from splatseg.errors import InputError, ShapeError
 from splatseg.io.evidence import FeatureEvidence, open_evidence
-from splatseg.models import ModelCache, find_model, record_evidence
+from splatseg.models import EvidenceRequest, ModelCache, find_model, record_evidence
 
 
 class Pyramid:
@@ -66,8 +66,8 @@ def test_see_writes_all_depths_and_the_class_token(views, tmp_path) -> None:
 def test_the_cache_holds_them_too(views, tmp_path) -> None:
     model = Pyramid()
     cache = ModelCache(folder=tmp_path / "cache")
-    record_evidence(model, views, tmp_path / "a", cache=cache)
-    record_evidence(model, views, tmp_path / "b", cache=cache)
+    record_evidence(model, views, tmp_path / "a", EvidenceRequest(cache=cache))
+    record_evidence(model, views, tmp_path / "b", EvidenceRequest(cache=cache))
     assert model.calls == len(views)
     for view in views:
         first, second = (tmp_path / name / f"{view.name}.npz" for name in "ab")
@@ -117,7 +117,7 @@ def test_evidence_of_one_depth_is_read_and_not_mixed_with_others(views, tmp_path
     (folder / "v2.npz").unlink()
     with pytest.raises(InputError, match="an earlier splatseg began this evidence"):
         record_evidence(Pyramid(), views, folder)
-    assert record_evidence(Pyramid(), views, folder, overwrite=True).kept == 0
+    assert record_evidence(Pyramid(), views, folder, EvidenceRequest(overwrite=True)).kept == 0
     check(open_evidence(folder), views, Pyramid())
 
 

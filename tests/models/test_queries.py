@@ -6,11 +6,11 @@ import torch.nn.functional as F
 
 from splatseg.core import ClassInfo, ClassTable
 from splatseg.errors import RangeError
-from splatseg.models import _queries
-from splatseg.models._class_names import NetworkClasses
-from splatseg.models._queries import (
+from splatseg.models.networks import segmenters
+from splatseg.models.networks.segmenters import (
+    NetworkClasses,
     Queries,
-    QueryOptions,
+    SegmenterOptions,
     SemanticOptions,
     enlarged,
     map_of_scores,
@@ -47,7 +47,7 @@ def whole(maps, height: int, width: int, **more) -> torch.Tensor:
 @pytest.mark.parametrize("size", [(33, 40), (7, 9), (5, 6)])
 @pytest.mark.parametrize("values", [1 << 25, 100])
 def test_strips_are_the_whole(rng, monkeypatch, size, values) -> None:
-    monkeypatch.setattr(_queries, "_VALUES", values)
+    monkeypatch.setattr(segmenters, "_VALUES", values)
     maps = torch.from_numpy(rng.normal(size=(3, 5, 6))).float()
     wanted = F.interpolate(maps[None], size, mode="bilinear")[0]
     torch.testing.assert_close(whole(maps, *size), wanted, rtol=0, atol=1e-5)
@@ -116,26 +116,26 @@ def test_segments_by_hand() -> None:
         ],
     )
     classes = classes_of(3, stuff={2})
-    found = panoptic_segments(queries, 1, 30, classes=classes, options=QueryOptions())
+    found = panoptic_segments(queries, 1, 30, classes=classes, options=SegmenterOptions())
     assert found.ids.ids.tolist() == [[-1] * 5 + [1] * 10 + [2] * 15], "the chair is hidden"
     rows = [(s.id, s.category, s.isthing, round(s.score, 3)) for s in found.segments]
     assert rows == [(1, 2, True, 0.99), (2, 3, False, 0.995)]
-    more = QueryOptions(min_visible=0.4)
+    more = SegmenterOptions(min_visible=0.4)
     found = panoptic_segments(queries, 1, 30, classes=classes, options=more)
     assert found.ids.ids.tolist() == [[1] * 5 + [2] * 10 + [3] * 15]
     assert [s.category for s in found.segments] == [1, 2, 3]
     all_things = panoptic_segments(queries, 1, 30, classes=classes_of(3), options=more)
     assert [s.category for s in all_things.segments] == [1, 2, 3, 3], "two walls"
-    unsure = QueryOptions(min_score=0.7, min_visible=0.0)
+    unsure = SegmenterOptions(min_score=0.7, min_visible=0.0)
     found = panoptic_segments(queries, 1, 30, classes=classes, options=unsure)
     assert int((found.ids.ids == -1).sum()) == 0
-    strict = QueryOptions(mask_threshold=0.92, min_visible=0.4)
+    strict = SegmenterOptions(mask_threshold=0.92, min_visible=0.4)
     found = panoptic_segments(queries, 1, 30, classes=classes, options=strict)
     assert [s.category for s in found.segments] == [1], "others have no pixel that sure"
     void = classes_of(3, stuff={2}, void=1)
     found = panoptic_segments(queries, 1, 30, classes=void, options=more)
     assert found.ids.ids.tolist() == [[1] * 10 + [-1] * 5 + [2] * 15], "nothing hides nothing"
-    none = QueryOptions(min_score=1.0)
+    none = SegmenterOptions(min_score=1.0)
     found = panoptic_segments(queries, 1, 30, classes=classes, options=none)
     assert found.segments == ()
     assert found.ids.ids.unique().tolist() == [-1]
@@ -175,7 +175,7 @@ def test_segments_agree_with_the_library(rng) -> None:
         )[0]  # fmt: skip
         found = panoptic_segments(
             cropped, 48, 64, classes=classes_of(4, stuff={0, 1}),
-            options=QueryOptions(min_score=0.6, min_visible=0.5),
+            options=SegmenterOptions(min_score=0.6, min_visible=0.5),
         )  # fmt: skip
         ids = torch.where(found.ids.ids > 0, found.ids.ids - 1, -1)
         assert torch.equal(ids, wanted["segmentation"].to(torch.int32))
@@ -194,7 +194,7 @@ def test_segments_agree_with_those_of_mask2former(rng) -> None:
     wanted = transformers.Mask2FormerImageProcessorPil().post_process_panoptic_segmentation(
         library_output(sure), threshold=0.8, overlap_mask_area_threshold=0.1, label_ids_to_fuse={0}
     )[0]
-    options = QueryOptions(min_score=0.8, min_visible=0.1)
+    options = SegmenterOptions(min_score=0.8, min_visible=0.1)
     found = panoptic_segments(sure, 384, 384, classes=classes_of(4, stuff={0}), options=options)
     labels = [one["label_id"] for one in wanted["segments_info"]]
     fused = [c for i, c in enumerate(labels) if c != 0 or c not in labels[:i]]
@@ -207,4 +207,4 @@ def test_segments_agree_with_those_of_mask2former(rng) -> None:
 @pytest.mark.parametrize("name", ["min_score", "mask_threshold", "min_visible", "min_confidence"])
 def test_options_are_shares(name: str) -> None:
     with pytest.raises(RangeError, match=name):
-        QueryOptions(**{name: 1.5})
+        SegmenterOptions(**{name: 1.5})

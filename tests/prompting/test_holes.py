@@ -6,7 +6,7 @@ import torch
 
 from splatseg.core import Selection
 from splatseg.errors import RangeError, ShapeError
-from splatseg.prompting.holes import HoleOptions, complete_membership, holes, specks
+from splatseg.prompting.graph import HoleOptions, complete_membership, holes, specks
 from support.ball_rows import balls_at, graph_of, grid, row_of
 
 

@@ -8,9 +8,9 @@ import torch
 from splatseg.core import Features, LayerInfo, Selection
 from splatseg.errors import InputError, ShapeError
 from splatseg.prompting.layer_source import LayerSource, shown_ids
+from splatseg.prompting.pipeline import MembershipSource, SimilaritySource
 from splatseg.prompting.prompts import ViewPrompt
 from splatseg.prompting.seen import see_prompts
-from splatseg.prompting.sources import MembershipSource, SimilaritySource
 from splatseg.render import weights
 
 # Pixels of the four fields, and of what has no label, in the front view.

@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from splatseg.prompting.minimum_cut import minimum_cut
+from splatseg.prompting.refine import minimum_cut
 
 
 def energy(x, unary, first, second, weights) -> float:

@@ -6,8 +6,14 @@ import pytest
 import torch
 
 from splatseg.core import InstanceTree, Labels, TreeNode
-from splatseg.prompting._near_click import Claim, agreed, claim, pixels_around
-from splatseg.prompting.layer_source import LayerSource, shown_ids
+from splatseg.prompting.layer_source import (
+    Claim,
+    LayerSource,
+    agreed,
+    claim,
+    pixels_around,
+    shown_ids,
+)
 from splatseg.prompting.prompts import ViewPrompt
 from splatseg.prompting.seen import see_prompts
 from splatseg.render import weights

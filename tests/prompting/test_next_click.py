@@ -6,14 +6,15 @@ import torch
 
 from splatseg.core import Selection
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.prompting.image_regions import (
+from splatseg.prompting.next_click import (
+    NextClickOptions,
+    choose_views,
     detached_regions,
     enclosed_regions,
     largest_region,
+    next_click,
     without_regions,
 )
-from splatseg.prompting.next_click import NextClickOptions, next_click
-from splatseg.prompting.view_choice import choose_views
 from support.ball_rows import balls_at, grid, view_of
 
 VIEW = view_of()

@@ -4,14 +4,14 @@ import pytest
 import torch
 
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.prompting.context import SceneIndex
 from splatseg.prompting.pipeline import (
+    SceneIndex,
     SelectionContext,
     checked_membership,
     next_click,
     postprocess,
 )
-from splatseg.prompting.view_cache import ViewCache
+from splatseg.prompting.seen import ViewCache
 
 
 @pytest.fixture

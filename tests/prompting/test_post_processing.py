@@ -9,12 +9,14 @@ from torch import Tensor
 
 from splatseg.errors import RangeError
 from splatseg.neighbours import NeighbourIndex, reference
-from splatseg.prompting.filtering import FilterOptions, neighbour_count, statistical_filter
-from splatseg.prompting.growing import (
+from splatseg.prompting.pipeline import (
+    FilterOptions,
     GrowOptions,
     ball_grow,
     growth_radius,
+    neighbour_count,
     region_grow,
+    statistical_filter,
 )
 
 

@@ -7,8 +7,7 @@ import torch
 
 from splatseg.errors import InputError, RangeError
 from splatseg.prompting.prompts import ViewPrompt
-from splatseg.prompting.seen import PromptOptions, see_prompts, thinned
-from splatseg.prompting.view_cache import ViewCache
+from splatseg.prompting.seen import PromptOptions, ViewCache, see_prompts, thinned
 from splatseg.render import weights
 
 

@@ -7,13 +7,23 @@ import torch
 
 from splatseg.neighbours import NeighbourIndex
 from splatseg.prompting import steps
-from splatseg.prompting.context import PostProcessing, SceneIndex, SelectionContext
-from splatseg.prompting.filtering import FilterOptions, statistical_filter
-from splatseg.prompting.growing import GrowOptions, ball_grow
+from splatseg.prompting.pipeline import (
+    FilterOptions,
+    GrowOptions,
+    PostProcessing,
+    SceneIndex,
+    SelectionContext,
+    advised,
+    ball_grow,
+    completed,
+    filled,
+    filtered,
+    grown,
+    refined,
+    statistical_filter,
+)
 from splatseg.prompting.prompts import ViewPrompt
-from splatseg.prompting.seen import see_prompts
-from splatseg.prompting.steps import advised, completed, filled, filtered, grown, refined
-from splatseg.prompting.view_cache import ViewCache
+from splatseg.prompting.seen import ViewCache, see_prompts
 from support.wall import field_ids
 
 

@@ -8,16 +8,17 @@ coarse logits; only the masks that are left are brought to the size of the image
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
+from msgspec import Meta
 from torch import Tensor
 
 from splatseg.core import MaskSet, Rle
-from splatseg.core.boundary import convert_fields
 from splatseg.core.models import Image
-from splatseg.errors import RangeError
+from splatseg.core.options import Count, Share, options
 
 _OVERLAP = 512 / 1500
 """Of neighbouring crops, by the shorter side of the image: the published value."""
@@ -28,52 +29,48 @@ _BORDER = 20
 _COMPARED = 256
 """Longer side at which masks are compared for their levels."""
 
+STABILITY_OFFSET = 1.0
+"""How far the threshold is moved each way, logits: the published value."""
+
+PROMPTS_PER_BATCH = 64
+"""Points that the network answers together: 64 as published. Changes time and memory only."""
+
+CONTAINED = 0.9
+"""Share of a mask that lies in a larger one which contains it."""
+
 Decode = Callable[[Float[Tensor, "n 2"]], tuple[Float[Tensor, "n m h w"], Float[Tensor, "n m"]]]
 """Logits of m masks for each point (x, y in pixels of the image), over the image alone, at whatever
 size, and the IoU that the network expects of each."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MaskGeneratorOptions:
-    """Which masks are kept; the defaults are the published ones."""
+@options(
+    removed={
+        "multimask": "three masks a point are always made",
+        "stability_offset": f"the threshold moves by {STABILITY_OFFSET:g} each way, as published",
+        "prompts_per_batch": "it never changed a result",
+    }
+)
+class SamOptions:
+    """Which automatic masks are kept; the defaults are the published ones."""
 
-    points_per_side: int = 32
+    points_per_side: Count = 32
     """Points of the grid along each side of the image."""
 
-    min_iou: float = 0.88
+    min_iou: Share = 0.88
     """Least IoU that the network expects of a mask, in [0, 1]."""
 
-    min_stability: float = 0.95
+    min_stability: Share = 0.95
     """Least share, in [0, 1], of the mask at a lower threshold that is left at a higher one."""
 
-    stability_offset: float = 1.0
-    """How far the threshold is moved each way, logits."""
-
-    max_overlap: float = 0.7
+    max_overlap: Share = 0.7
     """Boxes that overlap more, as IoU in [0, 1], are of one mask; the surest is kept."""
 
-    min_area: float = 0.0
+    min_area: Share = 0.0
     """Least share of the image, in [0, 1], that a mask covers."""
 
-    crop_layers: int = 0
+    crop_layers: Annotated[int, Meta(ge=0, le=3)] = 0
     """Layers of crops that are looked at too, 4 crops in the first, 16 in the second: finds what is
     small, for a pass of the network each."""
-
-    prompts_per_batch: int = 64
-    """Points that the network answers together. Changes time and memory only."""
-
-    def __post_init__(self) -> None:
-        convert_fields(self)
-        for name in ("points_per_side", "prompts_per_batch"):
-            if getattr(self, name) < 1:
-                raise RangeError(f"{name}: expected 1 or more, got {getattr(self, name)}.")
-        if not 0 <= self.crop_layers <= 3:
-            raise RangeError(f"crop_layers: expected 0 to 3, got {self.crop_layers}.")
-        for name in ("min_iou", "min_stability", "max_overlap", "min_area"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise RangeError(f"{name}: expected 0 to 1, got {getattr(self, name)}.")
-        if self.stability_offset < 0:
-            raise RangeError(f"stability_offset: expected 0 or more, got {self.stability_offset}.")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -93,17 +90,15 @@ def grid_points(per_side: int, height: int, width: int) -> Float[Tensor, "n 2"]:
     return torch.stack((x.reshape(-1), y.reshape(-1)), dim=1)
 
 
-def candidates(
-    decode: Decode, points: Float[Tensor, "n 2"], options: MaskGeneratorOptions
-) -> Candidates:
+def candidates(decode: Decode, points: Float[Tensor, "n 2"], options: SamOptions) -> Candidates:
     """The masks for points that are sure and stable; duplicates are not removed yet."""
     kept: list[Candidates] = []
-    for first in range(0, len(points), options.prompts_per_batch):
-        logits, scores = decode(points[first : first + options.prompts_per_batch])
+    for first in range(0, len(points), PROMPTS_PER_BATCH):
+        logits, scores = decode(points[first : first + PROMPTS_PER_BATCH])
         logits, scores = logits.flatten(0, 1), scores.flatten()
         sure = scores >= options.min_iou
         logits, scores = logits[sure], scores[sure]
-        steady = stability(logits, options.stability_offset) >= options.min_stability
+        steady = stability(logits, STABILITY_OFFSET) >= options.min_stability
         logits, scores = logits[steady].float(), scores[steady].float()
         shown = (logits > 0).flatten(1).any(dim=1)
         kept.append(
@@ -170,7 +165,7 @@ def _chosen(found: Candidates, index: Tensor) -> Candidates:
 
 
 def automatic_masks(
-    image: Image, decoder_of: Callable[[Image], Decode], options: MaskGeneratorOptions
+    image: Image, decoder_of: Callable[[Image], Decode], options: SamOptions
 ) -> MaskSet:
     """Masks of an image and, where crops are asked for, of parts of it, with their levels.
 
@@ -277,10 +272,6 @@ def _reduced(mask: Bool[Tensor, "height width"]) -> Bool[Tensor, "rows columns"]
     """A mask at a size at which many can be compared."""
     step = max(1, max(mask.shape) // _COMPARED)
     return mask[step // 2 :: step, step // 2 :: step]
-
-
-CONTAINED = 0.9
-"""Share of a mask that lies in a larger one which contains it."""
 
 
 def nesting_levels(masks: Bool[Tensor, "k pixels"]) -> Int[Tensor, "k"]:

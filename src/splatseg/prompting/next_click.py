@@ -1,31 +1,9 @@
-r"""Where the next click would help most.
-
-Two signals are rendered in a few views, the membership p of every Gaussian and the probability
-that its side is wrong,
-
-.. math:: P = W p, \qquad U = W \min(p, 1 - p)
-
-U is small where sure things of either side meet, though P is near 0.5 there: what a click can
-settle is what Gaussians are unsure of, not where the border runs. Three kinds of connected regions
-are worth a click:
-
-    uncertain   U is large
-    detached    selected, but apart in the view from what was clicked: is it the same thing?
-    hole        not selected and surrounded by what is: does it belong?
-
-A region is worth the wrong pixels that are to be expected in it, the sum of U, and of a prior in
-detached regions and holes, where sources of membership err more than they say. The best region
-of all views is asked for, at its pixel farthest from its rim.
-
-References:
-    Sofiiuk et al., Reviving Iterative Training with Mask Guidance for Interactive Segmentation
-    (2021): clicks at the point of an erroneous region that is farthest from its rim.
-"""
+"""Connected regions of pixels; two pixels are connected where they share a side."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, cast
 
 import numpy as np
 import torch
@@ -37,16 +15,179 @@ from splatseg._check import check_range, check_values
 from splatseg.core import Camera, Gaussians, Selection, View, camera_of_map
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.prompting.image_regions import (
-    detached_regions,
-    enclosed_regions,
-    largest_region,
-    without_regions,
-)
-from splatseg.prompting.view_choice import choose_views
 from splatseg.render import render
 
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ImageRegion:
+    """A connected region of pixels."""
+
+    pixel: tuple[int, int]
+    """Row and column of its pixel farthest from its rim."""
+
+    pixels: int
+    """How many it has."""
+
+    total: float
+    """Sum of the values in it."""
+
+
+def label_regions(mask: Mask) -> tuple[NDArray[np.int32], int]:
+    """The region of each pixel, from 1, 0 outside the mask; and how many there are."""
+    from scipy import ndimage
+
+    return cast("tuple[NDArray[np.int32], int]", ndimage.label(mask))
+
+
+def detached_regions(selected: Mask, clicked: NDArray[np.float64]) -> Mask:
+    """Selected pixels apart from the region that shows most of what was clicked.
+
+    Args:
+        selected: (H, W).
+        clicked: (H, W), how much each pixel shows of what was clicked, 0 or more. Where no
+            region shows any, the largest is the one that the others are apart from.
+    """
+    regions, count = label_regions(selected)
+    if count < 2:
+        return np.zeros_like(selected)
+    shown = np.bincount(regions.ravel(), weights=clicked.ravel(), minlength=count + 1)
+    sizes = np.bincount(regions.ravel(), minlength=count + 1)
+    shown[0], sizes[0] = 0, 0
+    own = int(shown.argmax()) if shown.any() else int(sizes.argmax())
+    return selected & (regions != own)
+
+
+def enclosed_regions(selected: Mask) -> Mask:
+    """Pixels that are not selected and surrounded by selected ones."""
+    from scipy import ndimage
+
+    return cast(Mask, ndimage.binary_fill_holes(selected)) & ~selected
+
+
+def without_regions(mask: Mask, pixels: Mask) -> Mask:
+    """The connected regions of a mask that have none of some pixels."""
+    regions, _ = label_regions(mask)
+    return mask & ~np.isin(regions, np.unique(regions[mask & pixels]))
+
+
+def largest_region(
+    mask: Mask, values: NDArray[np.float64], *, min_pixels: float = 0
+) -> ImageRegion | None:
+    """The connected region whose values, 0 or more, have the largest sum; None where that is 0.
+
+    Args:
+        mask: (H, W).
+        values: (H, W).
+        min_pixels: Regions of fewer pixels do not count.
+    """
+    from scipy import ndimage
+
+    regions, count = label_regions(mask)
+    sums = np.bincount(regions.ravel(), weights=values.ravel(), minlength=count + 1)
+    sizes = np.bincount(regions.ravel(), minlength=count + 1)
+    sums[0] = 0
+    sums[sizes < min_pixels] = 0
+    largest = int(sums.argmax())
+    if not sums[largest] > 0:
+        return None
+    # The edge of the image is a rim too: nobody sees what goes on behind it.
+    padded = np.pad(regions == largest, 1)
+    depth = cast("NDArray[np.float64]", ndimage.distance_transform_edt(padded))[1:-1, 1:-1]
+    row, column = np.unravel_index(int(depth.argmax()), depth.shape)
+    return ImageRegion(
+        pixel=(int(row), int(column)), pixels=int(sizes[largest]), total=float(sums[largest])
+    )
+
+
+# A few views of many: those that look at what matters, spread over the scene.
+
+
 _NEAR = 1e-6
+_MAX_POINTS = 5_000
+"""Points that are projected to find out what a view looks at."""
+
+
+def choose_views(
+    gaussians: Gaussians, views: Sequence[View], weights: Float[Tensor, "n"], *, most: int
+) -> list[View]:
+    """At most `most` views that have Gaussians of positive weight in their image.
+
+    The first is the one with the most weight in its image, occlusion aside. Each further one is
+    where that weight, relative to the largest, times the distance to the nearest view chosen
+    already is largest. In the order of choice; none where no view has any weight.
+
+    Args:
+        gaussians: The Gaussians of the scene.
+        views: To choose from.
+        weights: How much each Gaussian matters, 0 or more.
+        most: At least 1.
+    """
+    rows, heavy = _sample(weights.detach().double().cpu())
+    points = gaussians.means.detach().cpu()[rows].double()
+    shown = torch.tensor([_weight_in_image(view, points, heavy) for view in views])
+    candidates = torch.nonzero(shown > 0).squeeze(1)
+    if len(candidates) <= most:
+        order = torch.argsort(shown[candidates], descending=True, stable=True)
+        return [views[int(i)] for i in candidates[order]]
+    centres = torch.stack([view.camera.centre.double() for view in views])[candidates]
+    worth = shown[candidates] / shown.max()
+    chosen = [int(worth.argmax())]
+    distance = torch.linalg.vector_norm(centres - centres[chosen[0]], dim=1)
+    while len(chosen) < most:
+        score = worth * distance
+        score[chosen] = -1
+        chosen.append(int(score.argmax()))
+        further = torch.linalg.vector_norm(centres - centres[chosen[-1]], dim=1)
+        distance = torch.minimum(distance, further)
+    return [views[int(candidates[i])] for i in chosen]
+
+
+def _sample(weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Rows that stand for all, and their weights: quantiles of the weight, rows in order."""
+    rows = torch.nonzero(weights > 0).squeeze(1)
+    if len(rows) <= _MAX_POINTS:
+        return rows, weights[rows]
+    cumulative = torch.cumsum(weights[rows], dim=0)
+    share = cumulative[-1] / _MAX_POINTS
+    targets = (torch.arange(_MAX_POINTS, dtype=torch.float64) + 0.5) * share
+    chosen = torch.searchsorted(cumulative, targets).clamp_max(len(rows) - 1)
+    return rows[chosen], share.expand(_MAX_POINTS)
+
+
+def _weight_in_image(view: View, points: Tensor, weights: Tensor) -> float:
+    """Weight of the points in a view's image. Lens distortion is that of the camera's model."""
+    camera = view.camera
+    pixels, depth = camera.project(points)
+    inside = (depth > _NEAR) & (pixels >= 0).all(dim=1)
+    inside &= (pixels[:, 0] < camera.width) & (pixels[:, 1] < camera.height)
+    return float(weights[inside].sum())
+
+
+# Where the next click would help most.
+#
+# Two signals are rendered in a few views, the membership p of every Gaussian and the probability
+# that its side is wrong,
+#
+# .. math:: P = W p, \qquad U = W \min(p, 1 - p)
+#
+# U is small where sure things of either side meet, though P is near 0.5 there: what a click can
+# settle is what Gaussians are unsure of, not where the border runs. Three kinds of connected regions
+# are worth a click:
+#
+#     uncertain   U is large
+#     detached    selected, but apart in the view from what was clicked: is it the same thing?
+#     hole        not selected and surrounded by what is: does it belong?
+#
+# A region is worth the wrong pixels that are to be expected in it, the sum of U, and of a prior in
+# detached regions and holes, where sources of membership err more than they say. The best region
+# of all views is asked for, at its pixel farthest from its rim.
+#
+# References:
+#     Sofiiuk et al., Reviving Iterative Training with Mask Guidance for Interactive Segmentation
+#     (2021): clicks at the point of an erroneous region that is farthest from its rim.
+
 
 _MIN_ASKED = 0.25
 """Weight in a pixel of Gaussians that were pointed at, with which the pixel was asked already."""

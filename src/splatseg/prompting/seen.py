@@ -1,24 +1,177 @@
-r"""Prompts resolved to Gaussians: the rows of W of the pixels that a person shows.
+"""Prompts that say of the same Gaussians that they are the thing and that they are not.
 
-Row p of W has the blending weight :math:`w_{pi}` of every Gaussian i in the pixel. What a prompt
-means in the scene is therefore known without a threshold or a depth: by its rows.
+Two pixels show the same Gaussians as far as their rows of W have light in common,
+
+.. math:: \frac{\\sum_i \\min(w_{pi}, w_{qi})}{\\min(\\sum_i w_{pi}, \\sum_i w_{qi})}.
 """
 
+from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol, Self
 
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from splatseg._check import check_range, check_shape
-from splatseg.core import Gaussians, View
+from splatseg.core import Camera, Gaussians, View
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError, RangeError
-from splatseg.prompting._contradictions import check_contradictions
 from splatseg.prompting.prompts import ViewPrompt, pixels_in_box
-from splatseg.prompting.view_cache import ViewCache
-from splatseg.render import SparseWeights
+from splatseg.render import PreparedView, SparseWeights, prepare
+
+
+class _Seen(Protocol):
+    """What of a `SeenPrompt` is looked at."""
+
+    @property
+    def view(self) -> View: ...
+    @property
+    def rows(self) -> SparseWeights: ...
+    @property
+    def pixels(self) -> Int64[Tensor, "p 2"]: ...
+    @property
+    def positive(self) -> Bool[Tensor, "p"]: ...
+    @property
+    def dense(self) -> bool: ...
+
+
+def check_contradictions(seen: Sequence[_Seen], max_overlap: float) -> None:
+    """Refuse prompts that no set of Gaussians can satisfy.
+
+    Points are held against each other in pairs; masks and strokes as a whole, because where they
+    meet some pixels always see the same.
+
+    Raises:
+        InputError: If a positive and a negative prompt show the same Gaussians.
+    """
+    if all(bool(one.positive.all()) for one in seen):
+        return
+    _check_points([one for one in seen if not one.dense], max_overlap)
+    _check_regions(seen, max_overlap)
+    _check_regions([one for one in seen if one.dense], max_overlap)
+
+
+def _check_points(points: Sequence[_Seen], max_overlap: float) -> None:
+    """Each negative point against each positive one, whatever views they are in."""
+    if not points:
+        return
+    dense = _dense_rows(SparseWeights.concatenate([one.rows for one in points]))
+    positive = torch.cat([one.positive for one in points]).cpu()
+    sums = dense.sum(dim=1)
+    names = [
+        f"({x}, {y}) in view {one.view.name}" for one in points for x, y in one.pixels.tolist()
+    ]
+    for q in torch.nonzero(~positive).flatten().tolist():
+        shared = torch.minimum(dense, dense[q]).sum(dim=1) / torch.minimum(sums, sums[q])
+        clash = torch.nonzero(positive & (shared > max_overlap)).flatten().tolist()
+        if clash:
+            raise InputError(
+                f"points: expected positive and negative points on different Gaussians, got "
+                f"{names[clash[0]]} and {names[q]}, which contradict each other: they show the "
+                "same."
+            )
+
+
+def _check_regions(seen: Sequence[_Seen], max_overlap: float) -> None:
+    """The mean row of all positive pixels against that of all negative ones."""
+    if not seen:
+        return
+    rows = SparseWeights.concatenate([one.rows for one in seen]).to("cpu").compact().rows
+    positive = torch.cat([one.positive for one in seen]).cpu()
+    signs = torch.stack((positive, ~positive), dim=1).float()
+    first, second = (rows.adjoint(signs) / signs.sum(dim=0).clamp_min(1)).unbind(dim=1)
+    light = min(float(first.sum()), float(second.sum()))
+    if light > 0 and float(torch.minimum(first, second).sum()) > max_overlap * light:
+        raise InputError(
+            "prompts: expected positive and negative prompts on different Gaussians, got ones "
+            "that contradict each other: they show the same."
+        )
+
+
+def _dense_rows(rows: SparseWeights) -> Float[Tensor, "p m"]:
+    """Rows over the Gaussians that occur in them; a Gaussian that comes twice counts with both."""
+    compact = rows.to("cpu").compact().rows
+    row = torch.repeat_interleave(torch.arange(len(compact)), compact.indptr.diff())
+    cells = row * compact.gaussians + compact.ids.long()
+    flat = torch.bincount(
+        cells, weights=compact.weights.double(), minlength=len(compact) * compact.gaussians
+    )
+    return flat.reshape(len(compact), compact.gaussians)
+
+
+# Views that were prepared lately, so that the next click in one costs less than a millisecond.
+
+
+class ViewCache:
+    """Prepared views of some Gaussians, the latest few; a context that releases them.
+
+    To project and sort a view of 330 k Gaussians takes 50 ms, a row of its W then half of one.
+
+    Args:
+        gaussians: The Gaussians; they must stay as they are.
+        backend: Who renders.
+        capacity: How many views are kept, each some tens of megabytes; 1 or more.
+
+    Raises:
+        RangeError: If no view may be kept.
+    """
+
+    @boundary
+    def __init__(self, gaussians: Gaussians, *, backend: str = "auto", capacity: int = 4) -> None:
+        if capacity < 1:
+            raise RangeError(f"capacity: expected 1 or more, got {capacity}.")
+        self._gaussians = gaussians
+        self._backend = backend
+        self._capacity = capacity
+        # The camera is kept as long as its number is a key, which therefore is nobody else's.
+        self._views: OrderedDict[int, tuple[Camera, PreparedView]] = OrderedDict()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __len__(self) -> int:
+        return len(self._views)
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """Whose views they are."""
+        return self._gaussians
+
+    @property
+    def backend(self) -> str:
+        """Who renders."""
+        return self._backend
+
+    @boundary
+    def prepared(self, view: View) -> PreparedView:
+        """The view, prepared; it stays open until as many others as are kept were asked for."""
+        key = id(view.camera)
+        if key in self._views:
+            self._views.move_to_end(key)
+            return self._views[key][1]
+        made = prepare(self._gaussians, view.camera, backend=self._backend)
+        self._views[key] = (view.camera, made)
+        while len(self._views) > self._capacity:
+            self._views.popitem(last=False)[1][1].close()
+        return made
+
+    def close(self) -> None:
+        """Release all views; they are prepared again when asked for."""
+        for _, prepared in self._views.values():
+            prepared.close()
+        self._views.clear()
+
+
+# Prompts resolved to Gaussians: the rows of W of the pixels that a person shows.
+#
+# Row p of W has the blending weight :math:`w_{pi}` of every Gaussian i in the pixel. What a prompt
+# means in the scene is therefore known without a threshold or a depth: by its rows.
+
 
 _CENTRAL = 0.5
 """Sides of the central part of a box, as a share of its own."""

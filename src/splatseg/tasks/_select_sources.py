@@ -21,8 +21,8 @@ from splatseg.lift.affinity import KIND
 from splatseg.methods.saga import trained_as_published
 from splatseg.prompting.feature_source import FeatureSource, FeatureSourceOptions, ThresholdRule
 from splatseg.prompting.layer_source import LayerSource
-from splatseg.prompting.sources import MembershipSource
-from splatseg.prompting.view_cache import ViewCache
+from splatseg.prompting.pipeline import MembershipSource
+from splatseg.prompting.seen import ViewCache
 from splatseg.render import BackendName
 from splatseg.tasks._observer import Observer
 from splatseg.tasks.scene_parts import whole_layer

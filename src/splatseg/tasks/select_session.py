@@ -13,10 +13,13 @@ from torch import Tensor
 from splatseg.core import JSON, Gaussians, Layer, LayerInfo, PromptableMasks, Scene, Selection
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, ShapeError
-from splatseg.prompting.context import PostProcessing, SceneIndex
 from splatseg.prompting.pipeline import (
+    MembershipSource,
     NextClickHint,
+    PostProcessing,
+    SceneIndex,
     SelectionContext,
+    SimilaritySource,
     StepName,
     checked_membership,
     next_click,
@@ -31,9 +34,7 @@ from splatseg.prompting.prompts import (
     Solid,
     ViewPrompt,
 )
-from splatseg.prompting.seen import PromptOptions, SeenPrompt, see_prompts
-from splatseg.prompting.sources import MembershipSource, SimilaritySource
-from splatseg.prompting.view_cache import ViewCache
+from splatseg.prompting.seen import PromptOptions, SeenPrompt, ViewCache, see_prompts
 from splatseg.render import BackendName
 from splatseg.tasks._observer import SILENT, Observer
 from splatseg.tasks._select_prompter import segmented_prompts

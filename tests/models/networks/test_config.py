@@ -13,8 +13,7 @@ import torch
 
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.models import LoadOptions, find_model
-from splatseg.models.networks._config import offline
-from splatseg.models.networks._config_keys import FLAGS, NUMBERS, WORDS
+from splatseg.models.networks._config import FLAGS, NUMBERS, WORDS, offline
 from splatseg.models.networks._library import side_of
 from support.networks import IMAGE, KINDS, asked, checkpoint, in_parts
 

@@ -1,19 +1,145 @@
-"""The image side of LSeg: a dense prediction transformer, and one convolution to words' space.
+"""LSeg's network: a dense prediction transformer, CLIP's text encoder, a convolution between them.
 
-Ranftl et al. 2021 (arXiv:2103.13413), Li et al. 2022 (arXiv:2201.03546, section 3). What the papers
-leave open (bilinear positions, corners that stay corners, ReLU before the convolutions of a unit)
-is as the published weights were trained with.
+Ranftl et al. 2021 (arXiv:2103.13413), Radford et al. 2021 (arXiv:2103.00020, section 2.4), Li et
+al. 2022 (arXiv:2201.03546, section 3). What the papers leave open (bilinear positions, corners that
+stay corners, ReLU before the convolutions of a unit) is as the published weights were trained with.
 """
+
+from dataclasses import dataclass
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor, nn
 
-from splatseg.models.lseg._sizes import LEVELS, PATCH, Sizes
-from splatseg.models.lseg._transformer import Block
+LEVELS = 4
+"""Levels of the pyramid that a dense prediction transformer makes."""
 
-_EPSILON = 1e-6
+PATCH = 16
+"""Pixels of the input that a token of the image stands for, along both axes."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sizes:
+    """Numbers that say what the network's tensors are; its weights' shapes tell them."""
+
+    grid: int = 24
+    """Tokens along both axes that positions were learned for: 384 pixels."""
+
+    width: int = 1024
+    """Channels of a token of the image."""
+
+    blocks: int = 24
+    channels: tuple[int, int, int, int] = (256, 512, 1024, 1024)
+    """Channels of the pyramid's levels, the finest first."""
+
+    decoder: int = 256
+    """Channels of the decoder, and of its dense embedding."""
+
+    embedding: int = 512
+    """Channels of the space that images and words share."""
+
+    text_width: int = 512
+    text_blocks: int = 12
+    context: int = 77
+    """Most tokens of a text, its begin and its end included."""
+
+    vocabulary: int = 49408
+    """Tokens that are known."""
+
+
+HEAD_WIDTH = 64
+"""Channels of a head, in both sides and at every size that was published."""
+
+Activation = Literal["gelu", "quick_gelu"]
+
+
+class Attention(nn.Module):
+    r"""Attention of tokens to each other, over heads of `HEAD_WIDTH` channels.
+
+    .. math:: \mathrm{softmax}(Q K^\top / \sqrt{d}) V
+
+    Vaswani et al. 2017 (arXiv:1706.03762), eq. 1. A causal token attends to itself and to those
+    before it.
+    """
+
+    def __init__(self, width: int, *, causal: bool) -> None:
+        super().__init__()
+        self.qkv = nn.Linear(width, 3 * width)
+        self.out = nn.Linear(width, width)
+        self._heads = max(1, width // HEAD_WIDTH)
+        self._causal = causal
+
+    def forward(self, tokens: Float[Tensor, "n tokens width"]) -> Float[Tensor, "n tokens width"]:
+        """New tokens, without the residual."""
+        count, length, width = tokens.shape
+        parts = self.qkv(tokens).view(count, length, 3, self._heads, -1).permute(2, 0, 3, 1, 4)
+        query, key, value = parts.unbind()
+        mixed = F.scaled_dot_product_attention(query, key, value, is_causal=self._causal)
+        return self.out(mixed.transpose(1, 2).reshape(count, length, width))
+
+
+class Block(nn.Module):
+    """Attention and a perceptron, each after a normalisation and with a residual.
+
+    Dosovitskiy et al. 2021 (arXiv:2010.11929), eq. 2 and 3. CLIP has the same with x sigmoid(1.702
+    x) for the activation.
+    """
+
+    def __init__(self, width: int, *, causal: bool, activation: Activation, epsilon: float) -> None:
+        super().__init__()
+        self.norm_1 = nn.LayerNorm(width, eps=epsilon)
+        self.attention = Attention(width, causal=causal)
+        self.norm_2 = nn.LayerNorm(width, eps=epsilon)
+        self.wider = nn.Linear(width, 4 * width)
+        self.back = nn.Linear(4 * width, width)
+        self._activation = activation
+
+    def forward(self, tokens: Float[Tensor, "n tokens width"]) -> Float[Tensor, "n tokens width"]:
+        """Tokens after the block."""
+        tokens = tokens + self.attention(self.norm_1(tokens))
+        inner = self.wider(self.norm_2(tokens))
+        inner = (
+            F.gelu(inner) if self._activation == "gelu" else inner * torch.sigmoid(1.702 * inner)
+        )
+        return tokens + self.back(inner)
+
+
+_TEXT_EPSILON = 1e-5
+
+
+class TextTransformer(nn.Module):
+    """Tokens of a text as one vector: the last token's, as each attends to those before it."""
+
+    def __init__(self, sizes: Sizes) -> None:
+        super().__init__()
+        self.tokens = nn.Embedding(sizes.vocabulary, sizes.text_width)
+        self.positions = nn.Parameter(torch.zeros(sizes.context, sizes.text_width))
+        self.blocks = nn.ModuleList(
+            Block(sizes.text_width, causal=True, activation="quick_gelu", epsilon=_TEXT_EPSILON)
+            for _ in range(sizes.text_blocks)
+        )
+        self.norm = nn.LayerNorm(sizes.text_width, eps=_TEXT_EPSILON)
+        self.projection = nn.Parameter(torch.zeros(sizes.text_width, sizes.embedding))
+
+    def forward(
+        self, tokens: Int64[Tensor, "n tokens"], last: Int64[Tensor, "n"]
+    ) -> Float[Tensor, "n embedding"]:
+        """A vector a text, not normalised.
+
+        Args:
+            tokens: Texts, filled up to one length with any token.
+            last: Index of each text's last token, its end.
+        """
+        states = self.tokens(tokens) + self.positions[: tokens.shape[1]]
+        for block in self.blocks:
+            states = block(states)
+        ends = states[torch.arange(len(states), device=states.device), last]
+        return self.norm(ends) @ self.projection
+
+
+_IMAGE_EPSILON = 1e-6
 
 
 class ImageTransformer(nn.Module):
@@ -25,7 +151,7 @@ class ImageTransformer(nn.Module):
         self.class_token = nn.Parameter(torch.zeros(1, 1, sizes.width))
         self.positions = nn.Parameter(torch.zeros(1, 1 + sizes.grid**2, sizes.width))
         self.blocks = nn.ModuleList(
-            Block(sizes.width, causal=False, activation="gelu", epsilon=_EPSILON)
+            Block(sizes.width, causal=False, activation="gelu", epsilon=_IMAGE_EPSILON)
             for _ in range(sizes.blocks)
         )
         self._grid = sizes.grid
@@ -160,3 +286,21 @@ class DensePredictionTransformer(nn.Module):
         for fusion, level in zip(reversed(self.fusions), reversed(pyramid), strict=True):
             fused = fusion(level, fused)
         return pyramid[0] if fused is None else fused
+
+
+class LSegNetwork(nn.Module):
+    """Images and words in one space; Li et al. 2022, section 3."""
+
+    def __init__(self, sizes: Sizes) -> None:
+        super().__init__()
+        self.image = DensePredictionTransformer(sizes)
+        self.head = nn.Conv2d(sizes.decoder, sizes.embedding, kernel_size=1)
+        self.text = TextTransformer(sizes)
+
+    def in_word_space(self, decoded: Float[Tensor, "*n decoder"]) -> Float[Tensor, "*n embedding"]:
+        """Unit vectors in the space of words of vectors of the decoder's map.
+
+        The head is linear, so it may come after anything that is: averaging, lifting.
+        """
+        weight, bias = self.head.weight[:, :, 0, 0], self.head.bias
+        return F.normalize(F.linear(decoded.to(weight), weight, bias).float(), dim=-1)

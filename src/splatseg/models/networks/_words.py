@@ -1,4 +1,4 @@
-"""Tokenizers: from words to the numbers that a text encoder takes."""
+"""Words as networks take them: checked, in a sentence, as classes, as tokens, as vectors."""
 
 import hashlib
 import math
@@ -7,11 +7,95 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, cast
 
-from splatseg.errors import FileFormatError, RangeError
+import torch
+
+from splatseg.core import ClassInfo, ClassTable
+from splatseg.core.models import CANONICAL_PHRASES, TextFeaturesWithWords
+from splatseg.core.options import options
+from splatseg.errors import FileFormatError, InputError, RangeError
+from splatseg.io.evidence import TextEmbeddings
 from splatseg.io.json_files import read_json
-from splatseg.models._family import Loading
+from splatseg.models._weights import Loading
 from splatseg.models.networks._config import offline, refused_by_library
 from splatseg.models.networks._library import library
+
+_PLACE = "{}"
+
+
+def checked_words(words: Sequence[str], *, needed: str | None = None) -> tuple[str, ...]:
+    """Words without spaces around them, all different; at least one where somebody needs one."""
+    found = tuple(word.strip() for word in words)
+    if needed is not None and not found:
+        raise InputError(
+            f"words: {needed} looks for what words name, so expected at least one word "
+            "(--words chair table), got none."
+        )
+    if "" in found:
+        raise InputError("words: expected words or phrases, got an empty one.")
+    for word in found:
+        if found.count(word) > 1:
+            raise InputError(f"words: expected distinct words, got {word!r} more than once.")
+    return found
+
+
+@options
+class WordOptions:
+    """Which words are looked for."""
+
+    words: tuple[str, ...] = ()
+    """Words or phrases to look for; classes 1, 2, ... in this order."""
+
+    def __post_init__(self) -> None:
+        checked_words(self.words)
+
+
+@options
+class WordVectorOptions:
+    """How words come into the joint space of images and words."""
+
+    words: tuple[str, ...] = ()
+    """Words or phrases whose vectors are written beside the features, with the phrases that they
+    are compared with (object, things, stuff, texture). They can be changed later at no cost."""
+
+    template: str = "a photo of a {}"
+    """Sentence that each word stands in, at {}."""
+
+    def __post_init__(self) -> None:
+        checked_words(self.words)
+        if self.template.count(_PLACE) != 1:
+            raise InputError(
+                f"template: expected a sentence with {{}} once, where the word stands, "
+                f"got {self.template!r:.80}."
+            )
+
+
+def in_sentences(words: Sequence[str], template: str) -> list[str]:
+    """Words, each in its sentence."""
+    return [template.replace(_PLACE, word) for word in words]
+
+
+def word_classes(words: Sequence[str]) -> ClassTable:
+    """Words as classes of things: the ids 1, 2, ... in the order of the words."""
+    return ClassTable(
+        rows=tuple(ClassInfo(id=i, name=word) for i, word in enumerate(words, start=1))
+    )
+
+
+def word_vectors(model: TextFeaturesWithWords) -> TextEmbeddings:
+    """The vectors of a model's words, and of the phrases that words are compared with.
+
+    A phrase that is one of the words itself is left out: nothing is more relevant than itself.
+    """
+    words = model.words
+    phrases = tuple(phrase for phrase in CANONICAL_PHRASES if phrase not in words)
+    labels = (*words, *phrases)
+    return TextEmbeddings(
+        labels=labels,
+        vectors=torch.nn.functional.normalize(model.encode_text(labels).cpu().float(), dim=-1),
+        kinds=("class",) * len(words) + ("negative",) * len(phrases),
+        target_ids=(-1,) * len(labels),
+    )
+
 
 _FILES = (
     "tokenizer.json",

@@ -1,56 +1,52 @@
 """Masks without weights: superpixels, merged into ever larger regions, cut at several levels."""
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from splatseg._check import check_range
 from splatseg.core import UNLABELLED, LabelMap, MaskSet, Rle
-from splatseg.core.boundary import boundary, convert_fields
+from splatseg.core.boundary import boundary
 from splatseg.core.models import Image
+from splatseg.core.options import Share, options
 from splatseg.errors import InputError
 from splatseg.io.images import reduced_size
-from splatseg.models.classical._boundary import one_thread, pixel_features
-from splatseg.models.classical._merge_tree import MergeTree, merge_tree
+from splatseg.models._merge_tree import MergeTree, merge_tree, one_thread, pixel_features
 
 _FULL_CONTRAST = 0.6
 """Mean boundary strength along an outline that counts as certain."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RegionOptions:
+WORKING_SIZE = 640
+"""Longest side, in pixels, of the image that is divided. Masks have the photograph's own size."""
+
+SUPERPIXEL_SIZE = 9
+"""Side of the cells, in pixels at the working size, that start with one superpixel each."""
+
+
+@options(
+    removed={
+        "working_size": f"images are divided at {WORKING_SIZE} pixels along the longest side",
+        "superpixel_size": f"superpixels start in cells of {SUPERPIXEL_SIZE} pixels",
+    }
+)
+class ClassicalOptions:
     """How an image is divided into regions."""
-
-    working_size: int = 640
-    """Longest side, in pixels, of the image that is divided. Masks have the photograph's own
-    size all the same."""
-
-    superpixel_size: int = 9
-    """Side of the cells, in pixels at the working size, that start with one superpixel each."""
 
     cuts: tuple[float, ...] = (0.16, 0.25, 0.36, 0.5)
     """Costs of merging at which the hierarchy is cut, rising: one level of masks each, 0 the
     finest. A cost is about 1 where two large regions have nothing in common."""
 
-    min_area: float = 0.0005
+    min_area: Share = 0.0005
     """Masks smaller than this share of the image are dropped."""
 
     def __post_init__(self) -> None:
-        convert_fields(self)
-        if self.working_size < 16:
-            raise InputError(f"working_size: expected at least 16, got {self.working_size}.")
-        if self.superpixel_size < 2:
-            raise InputError(f"superpixel_size: expected at least 2, got {self.superpixel_size}.")
         rising = all(a < b for a, b in zip(self.cuts, self.cuts[1:], strict=False))
         if not self.cuts or self.cuts[0] <= 0 or not rising:
             raise InputError(f"cuts: expected positive, rising costs, got {self.cuts}.")
-        check_range("min_area", self.min_area, 0.0, 1.0)
 
 
 @boundary
-def region_masks(image: Image, options: RegionOptions | None = None) -> MaskSet:
+def region_masks(image: Image, options: ClassicalOptions | None = None) -> MaskSet:
     r"""Nested masks of several granularities. A stand-in for a learned mask generator.
 
     Superpixels of a watershed on boundary strength are merged, always the pair of neighbours of
@@ -67,19 +63,19 @@ def region_masks(image: Image, options: RegionOptions | None = None) -> MaskSet:
 
     Args:
         image: An image of any size.
-        options: Where the hierarchy is cut, and at what size the image is worked on.
+        options: Where the hierarchy is cut.
 
     Returns:
         Masks in the image's own pixels by level, then by area, largest first. A score is the
         geometric mean of how long the region stayed as it is while costs rose (1 - birth /
         death) and of how strong its outline is.
     """
-    options = RegionOptions() if options is None else options
+    options = options or ClassicalOptions()
     height, width = (int(s) for s in image.shape[:2])
     with one_thread():
-        small = reduced(image, options.working_size)
+        small = reduced(image, WORKING_SIZE)
         features = pixel_features(small)
-        leaves = _superpixels(features.strength, options.superpixel_size)
+        leaves = _superpixels(features.strength, SUPERPIXEL_SIZE)
         tree = merge_tree(leaves, features)
     nodes, levels = _cut_nodes(tree, options)
     scores = _scores(tree)[nodes]
@@ -149,7 +145,7 @@ def _superpixels(strength: NDArray[np.float32], size: int) -> NDArray[np.int32]:
     return (np.asarray(watershed(smooth, markers)) - 1).astype(np.int32)
 
 
-def _cut_nodes(tree: MergeTree, options: RegionOptions) -> tuple[list[int], list[int]]:
+def _cut_nodes(tree: MergeTree, options: ClassicalOptions) -> tuple[list[int], list[int]]:
     """Nodes that are whole regions at some cut, each with the first level where it is one."""
     birth, death = tree.birth(), tree.death()
     nodes: list[int] = []
