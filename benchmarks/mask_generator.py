@@ -17,8 +17,7 @@ from typing import Any
 import torch
 
 from splatseg.models import LoadOptions, find_model
-from splatseg.models._mask_generator import candidates, distinct, grid_points
-from splatseg.models.networks.sam import SamOptions
+from splatseg.models._mask_generator import SamOptions, candidates, distinct, grid_points
 
 
 def tiny(folder: Path, *, full: bool) -> Path:

@@ -452,6 +452,8 @@ def test_pictures_are_taken_one_at_a_time(moving, masks, tmp_path) -> None:
         assert len(taken) <= len(told), "none before its view is due"
         return load_image(view)
 
-    record_evidence(ByColour(), moving, tmp_path / "t", EvidenceRequest(seeds=masks, image_of=image_of), progress=lambda done, count: told.append((done, count)))  # fmt: skip
+    request = EvidenceRequest(seeds=masks, image_of=image_of)
+    progress = lambda done, count: told.append((done, count))  # noqa: E731
+    record_evidence(ByColour(), moving, tmp_path / "t", request, progress=progress)
     assert taken == [f"v{i}" for i in range(COUNT)]
     assert told == [(i, COUNT) for i in range(COUNT + 1)]

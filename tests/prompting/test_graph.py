@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from splatseg.core import Features, Selection
+from splatseg.core import Selection
 from splatseg.errors import RangeError, ShapeError
 from splatseg.lift.completion.graph import NodeAttributes, flat_normals, neighbour_graph
-from splatseg.prompting.graph import GraphOptions, build_graph
+from splatseg.prompting import graph as graph_module
+from splatseg.prompting.graph import build_graph
 from splatseg.selection import components
 from support.ball_rows import balls_at, graph_of, grid, row_of
 
@@ -26,8 +27,6 @@ def test_edges_are_those_of_the_matrix(rng) -> None:
     np.testing.assert_array_equal(rebuilt, dense[rows])
     assert graph.mean_degree == pytest.approx(dense.sum() / 50)
     assert len(graph) == 50
-    entries = len(graph.strengths.data)
-    assert graph.nbytes == 9 * entries + 4 * 51
 
 
 def test_touching_is_that_of_components(rng) -> None:
@@ -73,38 +72,23 @@ def test_normals_weaken_edges_as_the_formula_says() -> None:
     )
 
 
-def test_every_option_counts() -> None:
+def test_colours_and_normals_count(monkeypatch) -> None:
     colours = torch.tensor([[0.2] * 3, [0.4] * 3, [0.5] * 3, [0.5] * 3])
     turn = torch.tensor([[1.0, 0, 0, 0], [0.9, 0.3, 0, 0], [0.5, 0.5, 0.5, 0.5], [1, 0, 0, 0]])
     g = row_of(4, colours=colours).replace(
         rotations=turn, scales=torch.tensor([[0.3, 0.3, 0.05]]).expand(4, 3).clone()
     )
-    features = Features(values=torch.tensor([[1.0, 0], [0.9, 0.1], [0, 1], [0, 0]]))
-
-    def strengths(**options) -> np.ndarray:
-        chosen = GraphOptions(**{"neighbours": 2, **options})
-        return build_graph(g, features=features, options=chosen).strengths.toarray()
-
-    reference = strengths()
-    for change in (
-        {"neighbours": 1},
-        {"colour_width": 0.3},
-        {"feature_width": 0.1},
-        {"normal_width": 0.1},
-    ):
-        assert not np.array_equal(strengths(**change), reference), change
-    without = build_graph(g, options=GraphOptions(neighbours=2)).strengths.toarray()
-    assert not np.array_equal(without, reference)
+    reference = graph_of(g).strengths.toarray()
+    assert not np.array_equal(graph_of(g, 1).strengths.toarray(), reference)
+    for name, value in (("_COLOUR_WIDTH", 0.3), ("_NORMAL_WIDTH", 0.1)):
+        with monkeypatch.context() as patch:
+            patch.setattr(graph_module, name, value)
+            assert not np.array_equal(graph_of(g).strengths.toarray(), reference), name
 
 
 def test_what_is_refused() -> None:
-    for name in ("colour_width", "feature_width", "normal_width"):
-        with pytest.raises(RangeError, match=f"{name}: expected a positive number, got 0"):
-            GraphOptions(**{name: 0})
     with pytest.raises(RangeError, match="neighbours: expected at least 1"):
-        GraphOptions(neighbours=0)
-    with pytest.raises(ShapeError, match="features: expected 3 rows"):
-        build_graph(row_of(3), features=Features(values=torch.ones(2, 4)))
+        build_graph(row_of(3), neighbours=0)
     with pytest.raises(ShapeError, match="mask: expected 3 rows, those of the graph's"):
         graph_of(row_of(3)).check("mask", torch.zeros(2))
 

@@ -6,7 +6,8 @@ import torch
 
 from splatseg.core import Selection
 from splatseg.errors import RangeError, ShapeError
-from splatseg.prompting.graph import HoleOptions, complete_membership, holes, specks
+from splatseg.prompting import graph as module
+from splatseg.prompting.graph import complete_membership, holes, specks
 from support.ball_rows import balls_at, graph_of, grid, row_of
 
 
@@ -37,17 +38,23 @@ def test_what_is_enclosed_is_a_hole_and_what_leads_out_is_none() -> None:
     assert not holes(graph, selection).count, "it is one piece with what is around the cube"
 
 
-def test_two_holes_and_the_largest_that_is_filled() -> None:
+@pytest.fixture
+def constant(monkeypatch):
+    """Set a constant of the module."""
+    return lambda name, value: monkeypatch.setattr(module, name, value)
+
+
+def test_two_holes_and_the_largest_that_is_filled(constant) -> None:
     small, large = [at(2, 2, 2)], [at(4, 4, z) for z in (2, 3, 4)]
     graph, selection = cube(*small, *large)
     assert holes(graph, selection).count == 4
-    assert holes(graph, selection, options=HoleOptions(max_hole=3)).count == 4
-    found = holes(graph, selection, options=HoleOptions(max_hole=2))
-    assert found.ids.tolist() == small
-    assert not holes(graph, selection, options=HoleOptions(max_hole=0)).count
+    constant("_MAX_HOLE", 3)
+    assert holes(graph, selection).count == 4
+    constant("_MAX_HOLE", 2)
+    assert holes(graph, selection).ids.tolist() == small
 
 
-def test_a_small_thing_beside_the_selection_is_no_hole() -> None:
+def test_a_small_thing_beside_the_selection_is_no_hole(constant) -> None:
     """A row whose first half is selected; its last two balls lie at the selection's end."""
     g = row_of(8)
     selection = chosen(range(6), 8)
@@ -60,10 +67,11 @@ def test_a_small_thing_beside_the_selection_is_no_hole() -> None:
     graph = graph_of(g, 4)
     selection = chosen(range(6), 16)
     assert not holes(graph, selection).count
-    assert holes(graph, selection, options=HoleOptions(min_enclosed=0.3)).ids.tolist()[:2] == [6, 7]
+    constant("_MIN_ENCLOSED", 0.3)
+    assert holes(graph, selection).ids.tolist()[:2] == [6, 7]
 
 
-def test_holes_agree_with_a_search_of_the_whole_scene(rng) -> None:
+def test_holes_agree_with_a_search_of_the_whole_scene(rng, constant) -> None:
     """Against pieces of all that is not selected, whatever their size."""
     points = grid(9, 9)
     graph = graph_of(balls_at(points), 4)
@@ -74,26 +82,26 @@ def test_holes_agree_with_a_search_of_the_whole_scene(rng) -> None:
         for _ in range(7):
             reach = (reach.astype(int) @ reach.astype(int)) > 0
         expected = ~mask & (reach.sum(1) <= 6)
-        options = HoleOptions(max_hole=6, min_enclosed=0)
-        found = holes(graph, Selection(mask=torch.from_numpy(mask)), options=options)
+        constant("_MAX_HOLE", 6)
+        constant("_MIN_ENCLOSED", 0)
+        found = holes(graph, Selection(mask=torch.from_numpy(mask)))
         np.testing.assert_array_equal(found.mask.numpy(), expected)
 
 
-def test_specks_lie_apart_from_the_largest_piece_or_from_what_was_clicked() -> None:
+def test_specks_lie_apart_from_the_largest_piece_or_from_what_was_clicked(constant) -> None:
     graph = graph_of(row_of(30))
     selection = chosen([*range(10), 12, 13, *range(20, 24)], 30)
     assert specks(graph, selection).ids.tolist() == [12, 13, 20, 21, 22, 23]
-    small = HoleOptions(max_speck=3)
-    assert specks(graph, selection, options=small).ids.tolist() == [12, 13]
     found = specks(graph, selection, clicked=chosen([13, 15], 30))
     assert found.ids.tolist() == [*range(10), *range(20, 24)]
     elsewhere = specks(graph, selection, clicked=chosen([15], 30))
     assert elsewhere.ids.tolist() == [12, 13, 20, 21, 22, 23]
-    assert not specks(graph, selection, options=HoleOptions(max_speck=0)).count
     assert not specks(graph, chosen([], 30)).count
+    constant("_MAX_SPECK", 3)
+    assert specks(graph, selection).ids.tolist() == [12, 13]
 
 
-def test_hidden_memberships_are_those_of_random_walks(rng) -> None:
+def test_hidden_memberships_are_those_of_random_walks(rng, constant) -> None:
     """Against the linear system of the harmonic function."""
     g = balls_at(torch.from_numpy(rng.uniform(0, 3, (40, 3)).astype(np.float32)))
     graph = graph_of(g, 5)
@@ -105,16 +113,19 @@ def test_hidden_memberships_are_those_of_random_walks(rng) -> None:
     inverse = np.linalg.inv(np.eye(h.sum()) - walk[h][:, h])
     expected = p.numpy().copy()
     expected[h] = inverse @ walk[h][:, ~h] @ expected[~h]
-    found = complete_membership(graph, p, hidden, options=HoleOptions(spread_steps=2000))
+    constant("_SPREAD_STEPS", 2000)
+    found = complete_membership(graph, p, hidden)
     np.testing.assert_allclose(found.numpy(), expected, atol=1e-5)
 
 
-def test_memberships_spread_as_many_steps_as_asked_for() -> None:
+def test_memberships_spread_so_many_steps(monkeypatch) -> None:
     graph = graph_of(row_of(10))
     p = torch.zeros(10)
     p[0] = 1
     hidden = torch.arange(10) > 0
-    found = complete_membership(graph, p, hidden, options=HoleOptions(spread_steps=3))
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "_SPREAD_STEPS", 3)
+        found = complete_membership(graph, p, hidden)
     # The first has the second and the third for neighbours.
     assert found.tolist() == [1] * 5 + [0] * 5, "nothing but the first is known"
     assert complete_membership(graph, p, torch.zeros(10, dtype=torch.bool)).tolist() == p.tolist()
@@ -122,7 +133,7 @@ def test_memberships_spread_as_many_steps_as_asked_for() -> None:
     assert complete_membership(graph, p, hidden).tolist() == [1] * 10, "what is hidden is not read"
 
 
-def test_memberships_spread_from_likely_members() -> None:
+def test_memberships_spread_from_likely_members(constant) -> None:
     """Of two hidden balls at either end of a row one is next to a likely member."""
     graph = graph_of(row_of(9))
     p = torch.tensor([0, 0.2, 0.2, 0.2, 0.2, 0.6, 0.6, 0.6, 0])
@@ -130,7 +141,8 @@ def test_memberships_spread_from_likely_members() -> None:
     hidden[[0, 8]] = True
     found = complete_membership(graph, p, hidden)
     assert found.tolist() == pytest.approx([0, *p.tolist()[1:8], 0.6])
-    all_of_it = complete_membership(graph, p, hidden, options=HoleOptions(min_member=0.1))
+    constant("_MIN_MEMBER", 0.1)
+    all_of_it = complete_membership(graph, p, hidden)
     assert all_of_it.tolist() == pytest.approx([0.2, *p.tolist()[1:8], 0.6])
 
 
@@ -148,7 +160,3 @@ def test_what_is_refused() -> None:
             call()
     with pytest.raises(RangeError, match="membership"):
         complete_membership(graph, torch.full((5,), 2.0), long.mask)
-    wrong = {"max_hole": -1, "max_speck": -1, "spread_steps": 0, "min_enclosed": 2, "min_member": 0}
-    for name, value in wrong.items():
-        with pytest.raises(RangeError, match=name):
-            HoleOptions(**{name: value})

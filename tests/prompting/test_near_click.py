@@ -7,10 +7,10 @@ import torch
 
 from splatseg.core import InstanceTree, Labels, TreeNode
 from splatseg.prompting.layer_source import (
-    Claim,
     LayerSource,
+    NearestId,
     agreed,
-    claim,
+    nearest_id,
     pixels_around,
     shown_ids,
 )
@@ -50,31 +50,31 @@ def test_no_pixel_outside_the_picture_has_a_say() -> None:
         ([1.0, 0.6], {1: 400, 2: 100}, 2),  # 1 / 20 against 0.6 / 10
         ([1.0, 0.6], {1: 250, 2: 100}, 1),  # 1 / 15.8 against 0.6 / 10
         ([1.0, 1.0], {1: 100, 2: 100}, 1),
-        ([1.0, 0.5], {1: 400, 2: 100}, 2),  # equal claims: the smaller thing
+        ([1.0, 0.5], {1: 400, 2: 100}, 2),  # equal votes: the smaller thing
         ([1.0, 0.5], {1: 3}, 1),  # of 2 nobody knows a Gaussian: it counts as one
     ],
 )
 def test_a_small_thing_is_likelier_meant(votes, sizes, meant) -> None:
-    assert claim([1, 2], votes, thing_of=own, sizes=sizes).id == meant
+    assert nearest_id([1, 2], votes, thing_of=own, sizes=sizes).id == meant
 
 
 def test_parts_of_a_thing_speak_together_and_its_most_shown_part_answers() -> None:
     ids, votes = [1, 5, 6, 6], [1.0, 0.6, 0.3, 0.4]
     sizes = {1: 100, 2: 100, 5: 50, 6: 50}
-    found = claim(ids, votes, thing_of=lambda id: 2 if id > 4 else id, sizes=sizes)
+    found = nearest_id(ids, votes, thing_of=lambda id: 2 if id > 4 else id, sizes=sizes)
     assert (found.id, found.thing) == (6, 2)
     assert found.shares == pytest.approx({1: 1 / 2.3, 2: 1.3 / 2.3})
-    assert claim(ids, votes, thing_of=own, sizes=sizes | {5: 100, 6: 100}).id == 1
+    assert nearest_id(ids, votes, thing_of=own, sizes=sizes | {5: 100, 6: 100}).id == 1
 
 
 def test_a_click_at_the_border_of_what_another_means_adds_nothing() -> None:
-    middle = Claim(id=1, thing=1, shares={1: 1.0})
-    border = Claim(id=2, thing=2, shares={1: 0.25, 2: 0.75})
-    beyond = Claim(id=3, thing=3, shares={1: 0.15, 3: 0.85})
+    middle = NearestId(id=1, thing=1, shares={1: 1.0})
+    border = NearestId(id=2, thing=2, shares={1: 0.25, 2: 0.75})
+    beyond = NearestId(id=3, thing=3, shares={1: 0.15, 3: 0.85})
     assert agreed([middle, border]) == agreed([border, middle]) == [1]
     assert agreed([border]) == [2]
     assert agreed([middle, beyond]) == [1, 3]
-    again = Claim(id=5, thing=1, shares={1: 0.6, 2: 0.4})
+    again = NearestId(id=5, thing=1, shares={1: 0.6, 2: 0.4})
     assert agreed([middle, again]) == [1, 5]
 
 

@@ -201,8 +201,9 @@ def _writers(
     pictures: Pictures,
 ) -> Sequence[EvidenceWriter]:
     """What writes the answers to each question; a tracker goes through all views."""
-    recorded = isinstance(model, RecordedModel)
-    if not recorded and "tracked" in [ability(model, one) for one in questions]:
+    if not isinstance(model, RecordedModel) and "tracked" in [
+        ability(model, one) for one in questions
+    ]:
         if len(questions) > 1:
             raise InputError("what: expected tracked alone, since views come in its order.")
         if request.cache is not None:
@@ -216,7 +217,7 @@ def _writers(
         ]
     if request.seeds is not None or request.tracking is not None:
         raise InputError(f"seeds: expected with a tracker, got model {model.name!r}.")
-    if recorded:
+    if isinstance(model, RecordedModel):
         missing = request.allow_missing
         return [CopiedEvidence(model, views, one, allow_missing=missing) for one in questions]
     return [

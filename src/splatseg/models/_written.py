@@ -52,11 +52,10 @@ from splatseg.io.images import load_image
 from splatseg.io.json_files import read_json, write_json
 from splatseg.io.paths import path_inside
 from splatseg.models._cache import METHODS, ModelCache
-from splatseg.models._weights import What
 from splatseg.models.networks._words import word_vectors
 from splatseg.models.recorded import RecordedModel, check_grid, check_size
 
-_QUESTIONS: dict[What, tuple[type[Any], EvidenceKind]] = {
+_QUESTIONS: dict[str, tuple[type[Any], EvidenceKind]] = {
     "masks": (AutomaticMasks, "masks"),
     "panoptic": (PanopticSegments, "panoptic"),
     "labels": (SemanticLabels, "labels"),
@@ -169,7 +168,7 @@ class Pictures:
         self._kept.clear()
 
 
-def ability(model: Model, what: What | None) -> What:
+def ability(model: Model, what: str | None) -> str:
     """What a model is asked for; None takes the most telling that it can be.
 
     Raises:
@@ -224,14 +223,14 @@ class ComputedEvidence(EvidenceWriter):
         self,
         model: Any,
         views: Sequence[View],
-        what: What | None,
+        what: str | None,
         *,
         cache: ModelCache | None,
         pictures: Pictures,
     ) -> None:
         self.views = views
         self.details = {}
-        self.what: What = ability(model, what)
+        self.what = ability(model, what)
         self.kind = _QUESTIONS[self.what][1]
         if self.what in ("labels", "panoptic"):
             self.classes = model.classes if self.what == "labels" else model.categories
@@ -319,7 +318,7 @@ class CopiedEvidence(EvidenceWriter):
     """Evidence that others recorded, checked against the views and copied into our own layout."""
 
     def __init__(
-        self, model: RecordedModel, views: Sequence[View], what: What | None, *, allow_missing: bool
+        self, model: RecordedModel, views: Sequence[View], what: str | None, *, allow_missing: bool
     ) -> None:
         evidence = model.evidence
         if isinstance(evidence, AnnotationEvidence):

@@ -1,11 +1,19 @@
-"""Which id a click means, where it is close to the rim of something small.
+r"""A layer as a source: what belongs together was decided when the scene was segmented.
 
-People click at things, not at areas, and miss by a pixel; and the rims of small things are where
-masks err. The pixels around a click have a say, less the farther they are, and a small thing is
-likelier meant than a large one. With the distances :math:`d_p` of pixels from the click, in pixels,
-and the :math:`n_k` Gaussians of a thing k, a click means the k of the largest
+A click means the id that its pixel shows, the one with the largest blending weight in its row of
+W, as in a label map, unless it is at the rim of something smaller. People click at things, not at
+areas, and miss by a pixel; and the rims of small things are where masks err. So the pixels around a
+click have a say, less the farther they are, and a small thing is likelier meant than a large one.
+With the distances :math:`d_p` of pixels from the click, in pixels, and the :math:`n_k` Gaussians of
+a thing k, a click means the k of the largest
 
-.. math:: \frac{1}{\\sqrt{n_k}} \\sum_{p \text{ shows } k} e^{-d_p^2 / 2}.
+.. math:: \frac{1}{\sqrt{n_k}} \sum_{p \text{ shows } k} e^{-d_p^2 / 2}.
+
+Of a tree it means a node on the path of that id. How sure the answer is comes from the layer: with
+the evidence :math:`s_{in}` for the ids that were chosen and :math:`s_{out}` for the strongest other
+one,
+
+.. math:: c = \frac{s_{in}}{s_{in} + s_{out}}.
 """
 
 from collections import defaultdict
@@ -44,7 +52,7 @@ def pixels_around(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Claim:
+class NearestId:
     """What a click means."""
 
     id: int
@@ -55,14 +63,14 @@ class Claim:
     """Of each thing around the click, its share in what the pixels say; they add up to 1."""
 
 
-def claim(
+def nearest_id(
     ids: Sequence[int],
     votes: Sequence[float],
     *,
     thing_of: Callable[[int], int],
     sizes: Mapping[int, int],
-) -> Claim:
-    """What a click means; equal claims go to the smaller thing, then id.
+) -> NearestId:
+    """What a click means; of equal ones the smaller thing, then id.
 
     Args:
         ids: What the pixels around it show, at least one.
@@ -79,14 +87,14 @@ def claim(
     best = min(of_thing, key=lambda t: (-of_thing[t] / size[t] ** 0.5, size[t], t))
     own = [id for id in of_id if thing_of(id) == best]
     total = sum(of_thing.values())
-    return Claim(
+    return NearestId(
         id=min(own, key=lambda id: (-of_id[id], id)),
         thing=best,
         shares={thing: vote / total for thing, vote in of_thing.items()},
     )
 
 
-def agreed(claims: Sequence[Claim]) -> list[int]:
+def agreed(nearest: Sequence[NearestId]) -> list[int]:
     """Ids that several clicks on one thing mean together, each once.
 
     A click at the border of what another click means already says that this much belongs to the
@@ -95,22 +103,11 @@ def agreed(claims: Sequence[Claim]) -> list[int]:
     found: dict[int, None] = {}
     things: set[int] = set()
     # Clicks in the middle of something come before those at borders.
-    for one in sorted(claims, key=lambda one: -one.shares[one.thing]):
+    for one in sorted(nearest, key=lambda one: -one.shares[one.thing]):
         if one.thing in things or sum(one.shares.get(t, 0) for t in things) < _SHARED:
             things.add(one.thing)
             found[one.id] = None
     return list(found)
-
-
-# A layer as a source: what belongs together was decided when the scene was segmented.
-#
-# A click means the id that its pixel shows, the one with the largest blending weight in its row of
-# W, as in a label map, unless it is at the rim of something smaller (`_near_click`). Of a tree it
-# means a node on the path of that id. How sure the answer is
-# comes from the layer: with the evidence :math:`s_{in}` for the ids that were chosen and
-# :math:`s_{out}` for the strongest other one,
-#
-# .. math:: c = \frac{s_{in}}{s_{in} + s_{out}}.
 
 
 _MIN_STROKE_SHARE = 0.2
@@ -174,7 +171,7 @@ class LayerSource:
     def membership(
         self, prompts: Sequence[SeenPrompt], *, granularity: float | None = None
     ) -> Float[Tensor, "n"]:
-        """How likely each Gaussian belongs to what is shown, see `sources.MembershipSource`.
+        """How likely each Gaussian belongs to what is shown, see `MembershipSource`.
 
         Raises:
             InputError: If no positive prompt is on anything that the layer has a label for, or
@@ -250,7 +247,7 @@ class LayerSource:
             granularity: How large things are.
             hidden: Ids at negative points; only a click right on them means them.
         """
-        claims: list[Claim] = []
+        nearest: list[NearestId] = []
         for one in prompts:
             for pixel in () if one.dense else one.pixels[one.positive].cpu():
                 camera = one.view.camera
@@ -258,15 +255,15 @@ class LayerSource:
                 ids = shown_ids(self._labels, self._views.prepared(one.view).weights(pixels))
                 own = (pixels == pixel).all(dim=1)
                 said = own | torch.tensor([id not in hidden for id in ids.tolist()])
-                claims.append(
-                    claim(
+                nearest.append(
+                    nearest_id(
                         ids[said].tolist(),
                         votes[said].tolist(),
                         thing_of=lambda id: self._thing_of(id, granularity),
                         sizes=self._sizes,
                     )
                 )
-        return [id for id in agreed(claims) if id != UNLABELLED]
+        return [id for id in agreed(nearest) if id != UNLABELLED]
 
     def _thing_of(self, id: int, granularity: float | None) -> int:
         """The node that an id is of at a granularity; the id itself where there is no tree."""

@@ -1,6 +1,24 @@
-"""Connected regions of pixels; two pixels are connected where they share a side."""
+r"""Where the next click would help most.
 
-import math
+Two signals are rendered in a few views, the membership p of every Gaussian and the probability
+that its side is wrong,
+
+.. math:: P = W p, \qquad U = W \min(p, 1 - p)
+
+U is small where sure things of either side meet, though P is near 0.5 there: what a click can
+settle is what Gaussians are unsure of, not where the border runs. Three kinds of connected regions
+are worth a click:
+
+    uncertain   U is large
+    detached    selected, but apart in the view from what was clicked: is it the same thing?
+    hole        not selected and surrounded by what is: does it belong?
+
+A region is worth the wrong pixels that are to be expected in it, the sum of U, and of a prior in
+detached regions and holes, where sources of membership err more than they say. The best region
+of all views is asked for, at its pixel farthest from its rim (Sofiiuk et al., Reviving Iterative
+Training with Mask Guidance for Interactive Segmentation, 2021).
+"""
+
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, cast
@@ -11,13 +29,206 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splatseg._check import check_range, check_values
+from splatseg._check import check_values
 from splatseg.core import Camera, Gaussians, Selection, View, camera_of_map
-from splatseg.core.boundary import boundary, convert_fields
-from splatseg.errors import InputError, RangeError, ShapeError
+from splatseg.core.boundary import boundary
+from splatseg.errors import InputError, ShapeError
 from splatseg.render import render
 
 Mask = NDArray[np.bool_]
+RegionKind = Literal["uncertain", "detached", "hole"]
+
+_MAX_VIEWS = 20
+"""Most views that are rendered, those that show most of what is unsure, spread apart."""
+
+_LONGEST = 192
+"""Longest side that views are rendered at, pixels; a smaller view is not enlarged."""
+
+_MIN_UNCERTAINTY = 0.2
+"""Minimum U of a pixel that is uncertain: a membership of 0.2 to 0.8."""
+
+_HOLE_ERROR = 0.1
+"""Probability that a pixel of a hole is wrong however sure its Gaussians are: 0.12 was measured."""
+
+_DETACHED_ERROR = 0.02
+"""The same of a detached region: most are parts behind something."""
+
+_MIN_AREA = 20.0
+"""Minimum area of a region, pixels of the view; smaller ones are not asked for."""
+
+_NEAR = 1e-6
+_MAX_POINTS = 5_000
+"""Points that are projected to find out what a view looks at."""
+
+_MIN_ASKED = 0.25
+"""Weight in a pixel of Gaussians that were pointed at, with which the pixel was asked already."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class NextClick:
+    """A pixel of which a person should say whether it belongs."""
+
+    view: View
+
+    point: tuple[float, float]
+    """Column and row in the view, pixels; the centre of the top-left pixel is (0.5, 0.5)."""
+
+    kind: RegionKind
+    """Why it is asked for."""
+
+    probability: float
+    """Probability in [0, 1] that the pixel belongs, as far as is known."""
+
+    area: float
+    """Area of the region around it, pixels of the view."""
+
+    expected_error: float
+    """Wrong pixels to be expected in that region."""
+
+
+@boundary
+def next_click(
+    gaussians: Gaussians,
+    views: Sequence[View],
+    membership: Float[Tensor, "n"],
+    *,
+    clicked: Selection | None = None,
+    rejected: Selection | None = None,
+    backend: str = "auto",
+) -> NextClick | None:
+    """The pixel where a click would settle most.
+
+    Args:
+        gaussians: The Gaussians of the scene.
+        views: Where may be clicked, best the training views.
+        membership: p, the probability in [0, 1] that a Gaussian belongs.
+        clicked: Gaussians that positive prompts pointed at. What is selected but apart from them
+            in a view is detached; None takes the largest region of each view for the thing.
+        rejected: Gaussians that negative prompts pointed at. Of a hole or a detached region that
+            shows one of either was asked already, so it is not asked again.
+        backend: Name of the rendering backend.
+
+    Returns:
+        The click, or None where nothing is uncertain.
+    """
+    _check(gaussians, views, membership, {"clicked": clicked, "rejected": rejected})
+    p = membership.detach().to(gaussians.means)
+    wrong = torch.minimum(p, 1 - p)
+    signal = torch.stack((p, wrong, torch.zeros_like(p), torch.zeros_like(p)), dim=1)
+    for channel, pointed_at in ((2, clicked), (3, rejected)):
+        if pointed_at is not None:
+            signal[:, channel] = pointed_at.mask.to(signal)
+    # A signal is rendered without colours; none are evaluated or checked then.
+    plain = gaussians.replace(sh=gaussians.sh[:, :1])
+    best: NextClick | None = None
+    doubtful = torch.maximum(wrong, max(_HOLE_ERROR, _DETACHED_ERROR) * p)
+    # What is surely out makes no pixel uncertain, and what holes show lies between what is in.
+    likely = p >= _MIN_UNCERTAINTY
+    doubtful = torch.where(likely, doubtful, 0.0)
+    shown = gaussians[torch.nonzero(likely).squeeze(1)]
+    for view in choose_views(gaussians, views, doubtful, most=_MAX_VIEWS):
+        window = _window(view, shown)
+        if window is None:
+            continue
+        image = render(plain, window.camera, signal, backend=backend).image.detach().cpu().numpy()
+        for click in _regions(window, image):
+            if best is None or click.expected_error > best.expected_error:
+                best = click
+    return best
+
+
+def _check(
+    gaussians: Gaussians,
+    views: Sequence[View],
+    membership: Tensor,
+    selections: Mapping[str, Selection | None],
+) -> None:
+    if len(membership) != len(gaussians):
+        raise ShapeError(f"membership: expected {len(gaussians)} rows, got {len(membership)}.")
+    check_values("membership", membership, 0.0, 1.0)
+    for name, selection in selections.items():
+        if selection is not None and len(selection) != len(gaussians):
+            raise ShapeError(f"{name}: expected {len(gaussians)} rows, got {len(selection)}.")
+    if not views:
+        raise InputError("views: expected at least one that may be clicked in, got none.")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Window:
+    """The part of a view that shows what may belong, with fewer pixels."""
+
+    view: View
+    camera: Camera
+    left: int
+    top: int
+    across: float
+    """Pixels of the view from one pixel of the window to the next."""
+
+    down: float
+
+
+def _window(view: View, shown: Gaussians) -> _Window | None:
+    """The window of some Gaussians, three standard deviations around each; None without any."""
+    whole = view.camera
+    factor = min(1.0, _LONGEST / max(whole.width, whole.height))
+    height, width = (max(1, round(side * factor)) for side in (whole.height, whole.width))
+    camera = camera_of_map(view, height, width)
+    pixels, depth = camera.project(shown.means.detach().double())
+    ahead = depth > _NEAR
+    radius = 3 * shown.scales.detach().double().amax(dim=1) * max(camera.fx, camera.fy)
+    radius = (radius / depth.clamp_min(_NEAR)).unsqueeze(1) + 1
+    limits = torch.tensor([width, height], dtype=torch.float64, device=pixels.device)
+    inside = ahead & (pixels + radius > 0).all(1) & (pixels - radius < limits).all(1)
+    if not bool(inside.any()):
+        return None
+    low = (pixels - radius)[inside].amin(dim=0).clamp_min(0).floor()
+    high = torch.minimum((pixels + radius)[inside].amax(dim=0), limits).ceil()
+    (left, top), (right, bottom) = (map(int, corner.tolist()) for corner in (low, high))
+    part = replace(
+        camera,
+        width=max(1, right - left),
+        height=max(1, bottom - top),
+        cx=camera.cx - left,
+        cy=camera.cy - top,
+    )
+    return _Window(
+        view=view,
+        camera=part,
+        left=left,
+        top=top,
+        across=whole.width / width,
+        down=whole.height / height,
+    )
+
+
+def _regions(window: _Window, image: NDArray[np.float32]) -> Iterator[NextClick]:
+    """The largest region of each kind, as clicks."""
+    probability, wrong, clicked, rejected = (
+        image[..., i].astype(np.float64) for i in range(image.shape[2])
+    )
+    selected = probability > 0.5
+    asked = np.maximum(clicked, rejected) >= _MIN_ASKED
+    kinds: list[tuple[RegionKind, NDArray[np.bool_], NDArray[np.float64]]] = [
+        ("uncertain", wrong >= _MIN_UNCERTAINTY, wrong)
+    ]
+    detached = without_regions(detached_regions(selected, clicked), asked)
+    kinds.append(("detached", detached, np.maximum(wrong, _DETACHED_ERROR)))
+    enclosed = without_regions(enclosed_regions(selected), asked)
+    kinds.append(("hole", enclosed, np.maximum(wrong, _HOLE_ERROR)))
+    across, down = window.across, window.down
+    for kind, mask, error in kinds:
+        found = largest_region(mask, error, min_pixels=_MIN_AREA / (across * down))
+        if found is None:
+            continue
+        row, column = found.pixel
+        yield NextClick(
+            view=window.view,
+            point=((window.left + column + 0.5) * across, (window.top + row + 0.5) * down),
+            kind=kind,
+            probability=float(np.clip(probability[row, column], 0, 1)),
+            area=found.pixels * across * down,
+            expected_error=found.total * across * down,
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -101,14 +312,6 @@ def largest_region(
     )
 
 
-# A few views of many: those that look at what matters, spread over the scene.
-
-
-_NEAR = 1e-6
-_MAX_POINTS = 5_000
-"""Points that are projected to find out what a view looks at."""
-
-
 def choose_views(
     gaussians: Gaussians, views: Sequence[View], weights: Float[Tensor, "n"], *, most: int
 ) -> list[View]:
@@ -163,250 +366,3 @@ def _weight_in_image(view: View, points: Tensor, weights: Tensor) -> float:
     inside = (depth > _NEAR) & (pixels >= 0).all(dim=1)
     inside &= (pixels[:, 0] < camera.width) & (pixels[:, 1] < camera.height)
     return float(weights[inside].sum())
-
-
-# Where the next click would help most.
-#
-# Two signals are rendered in a few views, the membership p of every Gaussian and the probability
-# that its side is wrong,
-#
-# .. math:: P = W p, \qquad U = W \min(p, 1 - p)
-#
-# U is small where sure things of either side meet, though P is near 0.5 there: what a click can
-# settle is what Gaussians are unsure of, not where the border runs. Three kinds of connected regions
-# are worth a click:
-#
-#     uncertain   U is large
-#     detached    selected, but apart in the view from what was clicked: is it the same thing?
-#     hole        not selected and surrounded by what is: does it belong?
-#
-# A region is worth the wrong pixels that are to be expected in it, the sum of U, and of a prior in
-# detached regions and holes, where sources of membership err more than they say. The best region
-# of all views is asked for, at its pixel farthest from its rim.
-#
-# References:
-#     Sofiiuk et al., Reviving Iterative Training with Mask Guidance for Interactive Segmentation
-#     (2021): clicks at the point of an erroneous region that is farthest from its rim.
-
-
-_MIN_ASKED = 0.25
-"""Weight in a pixel of Gaussians that were pointed at, with which the pixel was asked already."""
-
-RegionKind = Literal["uncertain", "detached", "hole"]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class NextClickOptions:
-    """Where to look for the next click."""
-
-    max_views: int = 20
-    """Most views that are rendered, those that show most of what is unsure, spread apart."""
-
-    longest: int = 192
-    """Longest side that views are rendered at, pixels; a smaller view is not enlarged."""
-
-    min_uncertainty: float = 0.2
-    """Minimum U, in (0, 0.5], of a pixel that is uncertain: 0.2 is a membership of 0.2 to 0.8."""
-
-    hole_error: float = 0.1
-    """Probability, in [0, 0.5], that a pixel of a hole is wrong however sure its Gaussians are:
-    0.12 was measured. 0 leaves holes out."""
-
-    detached_error: float = 0.02
-    """The same of a detached region: most are parts behind something. 0 leaves them out."""
-
-    min_area: float = 20.0
-    """Minimum area of a region, pixels of the view; smaller ones are not asked for."""
-
-    def __post_init__(self) -> None:
-        convert_fields(self)
-        for name in ("max_views", "longest"):
-            if getattr(self, name) < 1:
-                raise RangeError(f"{name}: expected at least 1, got {getattr(self, name)}.")
-        if not 0 < self.min_uncertainty <= 0.5:
-            raise RangeError(
-                f"min_uncertainty: expected a value in (0, 0.5], got {self.min_uncertainty}."
-            )
-        check_range("hole_error", self.hole_error, 0.0, 0.5)
-        check_range("detached_error", self.detached_error, 0.0, 0.5)
-        if not (math.isfinite(self.min_area) and self.min_area >= 0):
-            raise RangeError(f"min_area: expected 0 or more, got {self.min_area}.")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class NextClick:
-    """A pixel of which a person should say whether it belongs."""
-
-    view: View
-
-    point: tuple[float, float]
-    """Column and row in the view, pixels; the centre of the top-left pixel is (0.5, 0.5)."""
-
-    kind: RegionKind
-    """Why it is asked for."""
-
-    probability: float
-    """Probability in [0, 1] that the pixel belongs, as far as is known."""
-
-    area: float
-    """Area of the region around it, pixels of the view."""
-
-    expected_error: float
-    """Wrong pixels to be expected in that region."""
-
-
-@boundary
-def next_click(
-    gaussians: Gaussians,
-    views: Sequence[View],
-    membership: Float[Tensor, "n"],
-    *,
-    clicked: Selection | None = None,
-    rejected: Selection | None = None,
-    options: NextClickOptions | None = None,
-    backend: str = "auto",
-) -> NextClick | None:
-    """The pixel where a click would settle most.
-
-    Args:
-        gaussians: The Gaussians of the scene.
-        views: Where may be clicked, best the training views.
-        membership: p, the probability in [0, 1] that a Gaussian belongs.
-        clicked: Gaussians that positive prompts pointed at. What is selected but apart from them
-            in a view is detached; None takes the largest region of each view for the thing.
-        rejected: Gaussians that negative prompts pointed at. Of a hole or a detached region that
-            shows one of either was asked already, so it is not asked again.
-        options: Where to look.
-        backend: Name of the rendering backend.
-
-    Returns:
-        The click, or None where nothing is uncertain.
-
-    Raises:
-        ShapeError: If there is not one membership a Gaussian.
-        RangeError: If a membership is not in [0, 1].
-        InputError: If there are no views.
-    """
-    options = options or NextClickOptions()
-    _check(gaussians, views, membership, {"clicked": clicked, "rejected": rejected})
-    p = membership.detach().to(gaussians.means)
-    wrong = torch.minimum(p, 1 - p)
-    signal = torch.stack((p, wrong, torch.zeros_like(p), torch.zeros_like(p)), dim=1)
-    for channel, pointed_at in ((2, clicked), (3, rejected)):
-        if pointed_at is not None:
-            signal[:, channel] = pointed_at.mask.to(signal)
-    # A signal is rendered without colours; none are evaluated or checked then.
-    plain = gaussians.replace(sh=gaussians.sh[:, :1])
-    best: NextClick | None = None
-    doubtful = torch.maximum(wrong, max(options.hole_error, options.detached_error) * p)
-    # What is surely out makes no pixel uncertain, and what holes show lies between what is in.
-    likely = p >= options.min_uncertainty
-    doubtful = torch.where(likely, doubtful, 0.0)
-    shown = gaussians[torch.nonzero(likely).squeeze(1)]
-    for view in choose_views(gaussians, views, doubtful, most=options.max_views):
-        window = _window(view, shown, options.longest)
-        if window is None:
-            continue
-        image = render(plain, window.camera, signal, backend=backend).image.detach().cpu().numpy()
-        for click in _regions(window, image, options):
-            if best is None or click.expected_error > best.expected_error:
-                best = click
-    return best
-
-
-def _check(
-    gaussians: Gaussians,
-    views: Sequence[View],
-    membership: Tensor,
-    selections: Mapping[str, Selection | None],
-) -> None:
-    if len(membership) != len(gaussians):
-        raise ShapeError(f"membership: expected {len(gaussians)} rows, got {len(membership)}.")
-    check_values("membership", membership, 0.0, 1.0)
-    for name, selection in selections.items():
-        if selection is not None and len(selection) != len(gaussians):
-            raise ShapeError(f"{name}: expected {len(gaussians)} rows, got {len(selection)}.")
-    if not views:
-        raise InputError("views: expected at least one that may be clicked in, got none.")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Window:
-    """The part of a view that shows what may belong, with fewer pixels."""
-
-    view: View
-    camera: Camera
-    left: int
-    top: int
-    across: float
-    """Pixels of the view from one pixel of the window to the next."""
-
-    down: float
-
-
-def _window(view: View, shown: Gaussians, longest: int) -> _Window | None:
-    """The window of some Gaussians, three standard deviations around each; None without any."""
-    whole = view.camera
-    factor = min(1.0, longest / max(whole.width, whole.height))
-    height, width = (max(1, round(side * factor)) for side in (whole.height, whole.width))
-    camera = camera_of_map(view, height, width)
-    pixels, depth = camera.project(shown.means.detach().double())
-    ahead = depth > _NEAR
-    radius = 3 * shown.scales.detach().double().amax(dim=1) * max(camera.fx, camera.fy)
-    radius = (radius / depth.clamp_min(_NEAR)).unsqueeze(1) + 1
-    limits = torch.tensor([width, height], dtype=torch.float64, device=pixels.device)
-    inside = ahead & (pixels + radius > 0).all(1) & (pixels - radius < limits).all(1)
-    if not bool(inside.any()):
-        return None
-    low = (pixels - radius)[inside].amin(dim=0).clamp_min(0).floor()
-    high = torch.minimum((pixels + radius)[inside].amax(dim=0), limits).ceil()
-    (left, top), (right, bottom) = (map(int, corner.tolist()) for corner in (low, high))
-    part = replace(
-        camera,
-        width=max(1, right - left),
-        height=max(1, bottom - top),
-        cx=camera.cx - left,
-        cy=camera.cy - top,
-    )
-    return _Window(
-        view=view,
-        camera=part,
-        left=left,
-        top=top,
-        across=whole.width / width,
-        down=whole.height / height,
-    )
-
-
-def _regions(
-    window: _Window, image: NDArray[np.float32], options: NextClickOptions
-) -> Iterator[NextClick]:
-    """The largest region of each kind, as clicks."""
-    probability, wrong, clicked, rejected = (
-        image[..., i].astype(np.float64) for i in range(image.shape[2])
-    )
-    selected = probability > 0.5
-    asked = np.maximum(clicked, rejected) >= _MIN_ASKED
-    kinds: list[tuple[RegionKind, NDArray[np.bool_], NDArray[np.float64]]] = [
-        ("uncertain", wrong >= options.min_uncertainty, wrong)
-    ]
-    if options.detached_error > 0:
-        mask = without_regions(detached_regions(selected, clicked), asked)
-        kinds.append(("detached", mask, np.maximum(wrong, options.detached_error)))
-    if options.hole_error > 0:
-        mask = without_regions(enclosed_regions(selected), asked)
-        kinds.append(("hole", mask, np.maximum(wrong, options.hole_error)))
-    across, down = window.across, window.down
-    for kind, mask, error in kinds:
-        found = largest_region(mask, error, min_pixels=options.min_area / (across * down))
-        if found is None:
-            continue
-        row, column = found.pixel
-        yield NextClick(
-            view=window.view,
-            point=((window.left + column + 0.5) * across, (window.top + row + 0.5) * down),
-            kind=kind,
-            probability=float(np.clip(probability[row, column], 0, 1)),
-            area=found.pixels * across * down,
-            expected_error=found.total * across * down,
-        )

@@ -1,4 +1,4 @@
-"""How the ids of a layer lie in a view against a mask or a box in it."""
+"""Which ids of a layer, or nodes of a tree, the prompts in a view mean."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -123,9 +123,6 @@ def box_iou(boxes: Int64[Tensor, "m 4"], box: Int64[Tensor, "4"]) -> Float[Tenso
     shared = (high - low).clamp_min(0).prod(dim=1)
     areas = (boxes[:, 2:] - boxes[:, :2]).prod(dim=1) + (box[2:] - box[:2]).prod()
     return shared.double() / (areas - shared).clamp_min(1).double()
-
-
-# Which node of a tree prompts mean.
 
 
 _OBJECT = 0.5

@@ -175,7 +175,6 @@ def _cleaned(
             views=views,
             neighbours=SceneIndex(scene.gaussians),
             source="text",
-            seed=options.seed,
         )
         return postprocess(confidence, context, enabled=options.steps)
 
