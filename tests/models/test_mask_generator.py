@@ -51,9 +51,9 @@ def test_of_boxes_that_overlap_the_surest_stays() -> None:
     boxes = torch.tensor([[0, 0, 1, 1], [0, 0, 1, 0.9], [0.5, 0.5, 1, 1], [0, 0, 1, 1.0]])
     scores = torch.tensor([0.8, 0.9, 0.7, 0.9])
     found = Candidates(logits=torch.zeros(4, 1, 1), scores=scores, boxes=boxes)
-    assert distinct(found, 0.7).tolist() == [1, 2], "the first of two equals"
-    assert distinct(found, 0.95).tolist() == [1, 3, 2]
-    assert distinct(found, 0.2).tolist() == [1]
+    assert distinct(found.boxes, found.scores, 0.7).tolist() == [1, 2], "the first of two equals"
+    assert distinct(found.boxes, found.scores, 0.95).tolist() == [1, 3, 2]
+    assert distinct(found.boxes, found.scores, 0.2).tolist() == [1]
 
 
 def test_levels_are_how_deep_a_mask_holds_others() -> None:

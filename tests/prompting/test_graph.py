@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from splatseg.core import Selection
-from splatseg.errors import RangeError, ShapeError
+from splatseg.errors import RangeError
 from splatseg.lift.completion.graph import NodeAttributes, flat_normals, neighbour_graph
 from splatseg.prompting import graph as graph_module
 from splatseg.prompting.graph import build_graph
@@ -89,8 +89,6 @@ def test_colours_and_normals_count(monkeypatch) -> None:
 def test_what_is_refused() -> None:
     with pytest.raises(RangeError, match="neighbours: expected at least 1"):
         build_graph(row_of(3), neighbours=0)
-    with pytest.raises(ShapeError, match="mask: expected 3 rows, those of the graph's"):
-        graph_of(row_of(3)).check("mask", torch.zeros(2))
 
 
 def test_few_gaussians_and_none() -> None:

@@ -9,8 +9,8 @@ npz. It appears under its name only when it is complete.
 import hashlib
 import io
 import json
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -23,18 +23,18 @@ from splatseg._check import check_finite
 from splatseg.core import DepthMap, FeatureMap, LabelMap, MaskSet, Rle, Segment
 from splatseg.core.boundary import convert_fields
 from splatseg.core.models import DeepFeatures, Embedding, Image, Model, Panoptic
-from splatseg.errors import FileFormatError, InputError, reason
+from splatseg.errors import InputError, reason
 from splatseg.io.atomic import atomic_file
 from splatseg.io.json_files import json_text, parse_object
 from splatseg.io.npz import open_npz
 from splatseg.models._images import image_digest
 
-_MAGIC = b"splatseg-cache 1\n"
+_MAGIC = b"splatseg-cache 2\n"
 _SUFFIX = ".entry"
 _DIGEST_BYTES = 32
 
-Answer = MaskSet | LabelMap | Panoptic | FeatureMap | DeepFeatures | DepthMap | Embedding
-"""What can be cached."""
+_PARTS = (LabelMap, Panoptic, Segment, FeatureMap, DeepFeatures, DepthMap, Embedding)
+"""What answers are made of besides masks, tensors and plain values."""
 
 METHODS = {
     "masks": "masks",
@@ -127,7 +127,7 @@ class _DamagedError(Exception):
     """An entry of the cache is not what was written."""
 
 
-def _encode(answer: Answer, precision: _Precision) -> bytes:
+def _encode(answer: object, precision: _Precision) -> bytes:
     import zstandard
 
     arrays: _Arrays = {}
@@ -139,14 +139,14 @@ def _encode(answer: Answer, precision: _Precision) -> bytes:
     return _MAGIC + hashlib.sha256(payload).digest() + payload
 
 
-def _read(path: Path) -> Answer:
+def _read(path: Path) -> Any:
     try:
         return _decode(path.read_bytes())
     except OSError as error:
         raise _DamagedError(f"it cannot be read ({error})") from error
 
 
-def _decode(content: bytes) -> Answer:
+def _decode(content: bytes) -> Any:
     import zstandard
 
     if not content.startswith(_MAGIC):
@@ -166,141 +166,83 @@ def _decode(content: bytes) -> Answer:
         raise _DamagedError(f"it does not hold what a model gives ({reason(error)})") from error
 
 
-def _pack(answer: Answer, at: str, precision: _Precision, arrays: _Arrays) -> dict[str, Any]:
-    if isinstance(answer, MaskSet):
-        counts = [mask.counts for mask in answer.masks]
+def _pack(value: Any, at: str, precision: _Precision, arrays: _Arrays) -> Any:
+    """What JSON holds of an answer or a part of one; arrays go to `arrays`, by their place.
+
+    Floats become float16 as in evidence, those of feature maps as the precision says; scores of
+    masks stay as they are.
+    """
+    if isinstance(value, MaskSet):
+        counts = [mask.counts for mask in value.masks]
         arrays[f"{at}counts"] = np.concatenate(counts) if counts else np.zeros(0, np.uint32)
         arrays[f"{at}lengths"] = np.array([len(c) for c in counts], np.int64)
-        arrays[f"{at}scores"] = answer.scores.cpu().numpy().astype(np.float32)
-        arrays[f"{at}levels"] = answer.levels.cpu().numpy().astype(np.int32)
-        return {"type": "masks", "height": answer.height, "width": answer.width}
-    if isinstance(answer, LabelMap):
-        arrays[f"{at}ids"] = answer.ids.cpu().numpy()
-        if answer.confidence is not None:
-            check_finite("confidence", answer.confidence)
-            arrays[f"{at}confidence"] = answer.confidence.cpu().numpy().astype(np.float16)
-        return {"type": "labels", "confidence": answer.confidence is not None}
-    if isinstance(answer, Panoptic):
-        rows = [[s.id, s.category, s.isthing, s.score] for s in answer.segments]
-        return {
-            "type": "panoptic",
-            "ids": _pack(answer.ids, f"{at}ids.", precision, arrays),
-            "segments": rows,
-        }
-    if isinstance(answer, FeatureMap):
-        _pack_floats("features", answer.features, f"{at}features", precision, arrays)
-        return {
-            "type": "features",
-            "stride": answer.stride,
-            "height": answer.height,
-            "width": answer.width,
-        }
-    if isinstance(answer, DeepFeatures):
-        if answer.class_token is not None:
-            _pack_floats("class token", answer.class_token, f"{at}token", "float16", arrays)
-        return {
-            "type": "deep",
-            "maps": [
-                _pack(m, f"{at}map{i}.", precision, arrays) for i, m in enumerate(answer.maps)
-            ],
-            "depths": list(answer.depths),
-            "token": answer.class_token is not None,
-        }
-    if isinstance(answer, DepthMap):
-        # As evidence has it, whatever the precision of features is.
-        _pack_floats("depth", answer.values, f"{at}depth", "float16", arrays)
-        if answer.confidence is not None:
-            _pack_floats("confidence", answer.confidence, f"{at}confidence", "float16", arrays)
-        return {
-            "type": "depth",
-            "kind": answer.kind,
-            "confidence": answer.confidence is not None,
-        }
-    for name, tensor in answer.arrays.items():
-        if tensor.is_floating_point():
-            _pack_floats(f"embedding {name!r}", tensor, f"{at}array.{name}", "float16", arrays)
+        arrays[f"{at}scores"] = value.scores.cpu().numpy().astype(np.float32)
+        arrays[f"{at}levels"] = value.levels.cpu().numpy().astype(np.int32)
+        return {"type": "MaskSet", "height": value.height, "width": value.width}
+    if isinstance(value, Tensor):
+        name = at.removesuffix(".")
+        if value.is_floating_point():
+            features = name.rpartition(".")[2] == "features" and not name.startswith("arrays.")
+            _pack_floats(name, value, precision if features else "float16", arrays)
         else:
-            arrays[f"{at}array.{name}"] = tensor.cpu().numpy()
-    return {
-        "type": "embedding",
-        "model": answer.model,
-        "height": answer.height,
-        "width": answer.width,
-        "view": answer.view,
-        "arrays": list(answer.arrays),
+            arrays[name] = value.cpu().numpy()
+        return {"type": "Tensor"}
+    if isinstance(value, Mapping):
+        items = cast("Mapping[str, Any]", value).items()
+        packed = {name: _pack(one, f"{at}{name}.", precision, arrays) for name, one in items}
+        return {"type": "dict", "items": packed}
+    if isinstance(value, tuple):
+        parts = enumerate(cast("tuple[Any, ...]", value))
+        return [_pack(one, f"{at}{i}.", precision, arrays) for i, one in parts]
+    if not isinstance(value, _PARTS):
+        return value
+    return {"type": type(value).__name__} | {
+        one.name: _pack(getattr(value, one.name), f"{at}{one.name}.", precision, arrays)
+        for one in fields(value)
     }
 
 
-def _unpack(header: dict[str, Any], at: str, arrays: _Arrays) -> Any:
-    kind = header["type"]
-    if kind == "masks":
-        height, width = header["height"], header["width"]
+def _unpack(header: Any, at: str, arrays: _Arrays) -> Any:
+    """Inverse of `_pack`, but for the precision of floats."""
+    if isinstance(header, list):
+        parts = enumerate(cast("list[Any]", header))
+        return tuple(_unpack(one, f"{at}{i}.", arrays) for i, one in parts)
+    if not isinstance(header, dict):
+        return header
+    known = dict(cast("dict[str, Any]", header))
+    kind = known.pop("type")
+    if kind == "Tensor":
+        return _unpack_floats(at.removesuffix("."), arrays)
+    if kind == "dict":
+        known = known["items"]
+    if kind == "MaskSet":
+        size = {"height": known["height"], "width": known["width"]}
         ends = np.cumsum(arrays[f"{at}lengths"])
-        parts = np.split(arrays[f"{at}counts"], ends[:-1]) if len(ends) else []
+        counts = np.split(arrays[f"{at}counts"], ends[:-1]) if len(ends) else []
         return MaskSet(
-            height=height,
-            width=width,
-            masks=tuple(Rle(height=height, width=width, counts=c) for c in parts),
+            **size,
+            masks=tuple(Rle(**size, counts=c) for c in counts),
             scores=torch.from_numpy(arrays[f"{at}scores"]),
             levels=torch.from_numpy(arrays[f"{at}levels"]),
         )
-    if kind == "labels":
-        confidence = (
-            torch.from_numpy(arrays[f"{at}confidence"]).float() if header["confidence"] else None
-        )
-        return LabelMap(ids=torch.from_numpy(arrays[f"{at}ids"]), confidence=confidence)
-    if kind == "panoptic":
-        rows = [
-            Segment(id=id, category=category, isthing=thing, score=score)
-            for id, category, thing, score in header["segments"]
-        ]
-        return Panoptic(ids=_unpack(header["ids"], f"{at}ids.", arrays), segments=tuple(rows))
-    if kind == "features":
-        return FeatureMap(
-            features=_unpack_floats(f"{at}features", arrays),
-            stride=header["stride"],
-            height=header["height"],
-            width=header["width"],
-        )
-    if kind == "deep":
-        return DeepFeatures(
-            maps=tuple(_unpack(m, f"{at}map{i}.", arrays) for i, m in enumerate(header["maps"])),
-            depths=tuple(header["depths"]),
-            class_token=_unpack_floats(f"{at}token", arrays) if header["token"] else None,
-        )
-    if kind == "depth":
-        sure = _unpack_floats(f"{at}confidence", arrays) if header["confidence"] else None
-        return DepthMap(
-            values=_unpack_floats(f"{at}depth", arrays), kind=header["kind"], confidence=sure
-        )
-    if kind != "embedding":
-        raise FileFormatError(f"cache: expected what a model gives, got {kind!r}.")
-    return Embedding(
-        model=header["model"],
-        height=header["height"],
-        width=header["width"],
-        view=header["view"],
-        arrays={name: _unpack_floats(f"{at}array.{name}", arrays) for name in header["arrays"]},
-    )
+    values = {name: _unpack(one, f"{at}{name}.", arrays) for name, one in known.items()}
+    if kind == "dict":
+        return values
+    return next(part for part in _PARTS if part.__name__ == kind)(**values)
 
 
-def _pack_floats(
-    what: str, values: Tensor, key: str, precision: _Precision, arrays: _Arrays
-) -> None:
+def _pack_floats(key: str, values: Tensor, precision: _Precision, arrays: _Arrays) -> None:
     """Floats as float16, or as int8 with a scale and an offset per channel (the last axis)."""
-    check_finite(what, values)
+    check_finite(key, values)
     array = values.detach().cpu().numpy().astype(np.float32)
     if precision == "float16":
         half = values.detach().cpu().to(torch.float16)
-        check_finite(f"{what} as float16", half)
+        check_finite(f"{key} as float16", half)
         arrays[key] = half.numpy()
         return
     flat = array.reshape(-1, array.shape[-1])
-    low, high = (
-        (flat.min(0), flat.max(0))
-        if len(flat)
-        else (np.zeros(array.shape[-1], np.float32), np.zeros(array.shape[-1], np.float32))
-    )
+    flat = flat if len(flat) else np.zeros((1, array.shape[-1]), np.float32)
+    low, high = flat.min(0), flat.max(0)
     scale = np.where(high > low, (high - low) / 254, 1).astype(np.float32)
     offset = ((high + low) / 2).astype(np.float32)
     arrays[key] = np.clip(np.rint((array - offset) / scale), -127, 127).astype(np.int8)

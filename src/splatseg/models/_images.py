@@ -289,10 +289,9 @@ class InputSize:
         Raises:
             FileFormatError: If a size is no number of pixels.
         """
-        path = folder / "preprocessor_config.json"
-        if not path.is_file():
+        path, content = _image_settings(folder)
+        if not content:
             return otherwise
-        content = read_json(path)
         size = content.get("size")
         multiple = otherwise.multiple
         for name in _MULTIPLES:

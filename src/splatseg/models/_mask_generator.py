@@ -82,6 +82,13 @@ class Candidates:
     boxes: Float[Tensor, "k 4"]
     """x0, y0, x1, y1 in [0, 1] of the image."""
 
+    def without_duplicates(self, max_overlap: float) -> "Candidates":
+        """Those that no surer one overlaps more, by their boxes."""
+        index = distinct(self.boxes, self.scores, max_overlap)
+        return Candidates(
+            logits=self.logits[index], scores=self.scores[index], boxes=self.boxes[index]
+        )
+
 
 def grid_points(per_side: int, height: int, width: int) -> Float[Tensor, "n 2"]:
     """Points in the middle of the cells of a grid over an image, row by row; x, y in pixels."""
@@ -107,7 +114,7 @@ def candidates(decode: Decode, points: Float[Tensor, "n 2"], options: SamOptions
             )
         )
         # One batch may keep thousands of copies of a thing; they need not wait for the end.
-        kept[-1] = _chosen(kept[-1], distinct(kept[-1], options.max_overlap))
+        kept[-1] = kept[-1].without_duplicates(options.max_overlap)
     return Candidates(
         logits=torch.cat([one.logits for one in kept]),
         scores=torch.cat([one.scores for one in kept]),
@@ -136,10 +143,12 @@ def mask_boxes(masks: Bool[Tensor, "k h w"]) -> Float[Tensor, "k 4"]:
     return torch.stack((x0, y0, x1, y1), dim=1).float()
 
 
-def distinct(found: Candidates, max_overlap: float) -> Int[Tensor, "kept"]:
+def distinct(
+    boxes: Float[Tensor, "k 4"], scores: Float[Tensor, "k"], max_overlap: float
+) -> Int[Tensor, "kept"]:
     """Non-maximum suppression: of boxes that overlap the surest stays, the first among equals."""
-    order = torch.sort(found.scores, descending=True, stable=True).indices
-    overlaps = _box_iou(found.boxes[order]) > max_overlap
+    order = torch.sort(scores, descending=True, stable=True).indices
+    overlaps = _box_iou(boxes[order]) > max_overlap
     gone = torch.zeros(len(order), dtype=torch.bool)
     rows = overlaps.cpu()
     kept: list[int] = []
@@ -156,12 +165,6 @@ def _box_iou(boxes: Float[Tensor, "k 4"]) -> Float[Tensor, "k k"]:
     both = (high - low).clamp_min(0).prod(dim=2)
     area = (boxes[:, 2:] - boxes[:, :2]).prod(dim=1)
     return both / (area[:, None] + area[None] - both).clamp_min(1e-12)
-
-
-def _chosen(found: Candidates, index: Tensor) -> Candidates:
-    return Candidates(
-        logits=found.logits[index], scores=found.scores[index], boxes=found.boxes[index]
-    )
 
 
 def automatic_masks(
@@ -181,15 +184,14 @@ def automatic_masks(
         rows, columns = (int(side) for side in part.shape[:2])
         points = grid_points(options.points_per_side, rows, columns)
         seen = candidates(decoder_of(part), points, options)
-        seen = _chosen(seen, distinct(seen, options.max_overlap))
+        seen = seen.without_duplicates(options.max_overlap)
         found += _placed(seen, crop, layer, (height, width), options.min_area)
     # What a finer layer of crops saw comes before what a coarser one did.
     found.sort(key=lambda one: (-one.layer, -one.score))
     if options.crop_layers and found:
         boxes = torch.tensor([one.box for one in found])
         rank = torch.arange(len(found), 0, -1, dtype=torch.float32)
-        whole = Candidates(logits=boxes[:, None, :], scores=rank, boxes=boxes)
-        found = [found[i] for i in distinct(whole, options.max_overlap).tolist()]
+        found = [found[i] for i in distinct(boxes, rank, options.max_overlap).tolist()]
     found.sort(key=lambda one: -one.score)
     small = [_reduced(one.mask.decode()) for one in found]
     return MaskSet(

@@ -426,12 +426,8 @@ def _fetched(id: str, report: Callable[[str], None], flag: str) -> Path:
 def _wanted(sizes: Mapping[str, int]) -> tuple[Sequence[str], int]:
     """The files of a repository that are needed, and their bytes: one format of the weights."""
     top = [name for name in sizes if "/" not in name]
-    for pattern in _WEIGHTS:
-        weights = [name for name in top if Path(name).match(pattern)]
-        if weights:
-            break
-    else:
-        weights = []
+    by_format = ([name for name in top if Path(name).match(one)] for one in _WEIGHTS)
+    weights = next((names for names in by_format if names), [])
     names = [name for name in top if any(Path(name).match(p) for p in _FILES)] + weights
     return names, sum(sizes[name] for name in names)
 

@@ -8,12 +8,13 @@ classes. No library has it; the published checkpoint is read as it is.
 import math
 import re
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal, cast
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int64
+from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
@@ -22,14 +23,14 @@ from splatseg.core import FeatureMap
 from splatseg.core.boundary import boundary
 from splatseg.core.models import DeepFeatures, Image
 from splatseg.core.options import options
-from splatseg.errors import FileFormatError, InputError, MissingFileError
+from splatseg.errors import FileFormatError, MissingFileError
 from splatseg.io.tensors import read_tensors
 from splatseg.io.torch_files import read_torch_file
 from splatseg.models._images import HALVES, PatchGrid, patch_grid, patch_input
 from splatseg.models._lseg_network import LEVELS, PATCH, LSegNetwork, Sizes
 from splatseg.models._weights import Loading, cached_file
-from splatseg.models.networks._config import offline, refused_by_library
-from splatseg.models.networks._library import BatchedNetwork, library
+from splatseg.models.networks._library import BatchedNetwork
+from splatseg.models.networks._words import Tokens
 
 _STEP = 2
 """Pixels of the input that a cell of the decoder's map stands for."""
@@ -47,15 +48,7 @@ PUBLISHED = "openai/clip-vit-base-patch32"
 
 
 def tokenizer_folder(asked: str | None, weights: Path) -> Path:
-    """The folder of the vocabulary: the one asked for, else that of the weights.
-
-    Args:
-        asked: A folder, or an id of the hub, of which only what is on this machine is taken.
-        weights: The folder of the weights.
-
-    Raises:
-        MissingFileError: If there is no vocabulary.
-    """
+    """The folder of the vocabulary: the one asked for, or an id of the hub, else the weights'."""
     folder = weights if asked is None else Path(asked)
     if _is_tokenizer(folder):
         return folder
@@ -79,42 +72,6 @@ def _is_tokenizer(folder: Path) -> bool:
     return (folder / _TOKENIZER).is_file() or all(
         (folder / name).is_file() for name in _TOKENIZER_PARTS
     )
-
-
-class Tokenizer:
-    """Words as tokens."""
-
-    def __init__(self, folder: Path, *, vocabulary: int, context: int) -> None:
-        """Read a vocabulary of so many tokens, for texts of at most `context` of them."""
-        cls = library().CLIPTokenizer
-        with offline(), refused_by_library(folder, "the vocabulary of CLIP"):
-            self._tokenizer: Any = cls.from_pretrained(folder, local_files_only=True)
-            size = len(self._tokenizer)
-        if size != vocabulary:
-            raise FileFormatError(
-                f"{folder}: expected a vocabulary of {vocabulary} tokens, as the weights have, "
-                f"got {size}."
-            )
-        self._context = context
-
-    def tokens(self, words: Sequence[str]) -> tuple[Int64[Tensor, "n tokens"], Int64[Tensor, "n"]]:
-        """Tokens of each text, filled up with zeros, and the index of its last one.
-
-        Raises:
-            InputError: If a text has more tokens than the network takes.
-        """
-        found = [[int(token) for token in self._tokenizer(word)["input_ids"]] for word in words]
-        for word, ids in zip(words, found, strict=True):
-            if len(ids) > self._context:
-                raise InputError(
-                    f"words: expected texts of at most {self._context} tokens, got {len(ids)} "
-                    f"({word!r:.60})."
-                )
-        last = torch.tensor([len(ids) - 1 for ids in found])
-        filled = torch.zeros(len(found), max(map(len, found)), dtype=torch.int64)
-        for row, ids in zip(filled, found, strict=True):
-            row[: len(ids)] = torch.tensor(ids)
-        return filled, last
 
 
 @options
@@ -149,7 +106,7 @@ class LSeg(BatchedNetwork[Tensor]):
         self._cell = options.cell
         self._network = network.to(place.device, place.dtype)
         self._input_size = place.size or _TRAINED_SIZE
-        self._tokenizer: Tokenizer | None = None
+        self._tokenizer: Tokens | None = None
         if options.tokenizer is not None:
             self._tokenizer = self._read_tokenizer()
 
@@ -183,26 +140,31 @@ class LSeg(BatchedNetwork[Tensor]):
         Raises:
             MissingFileError: If CLIP's vocabulary is not on this machine.
             FileFormatError: If it is broken, or does not fit the weights.
-            InputError: If a text is too long.
+            RangeError: If a text is too long.
         """
         if not words:
             return torch.zeros(0, self._network.head.out_channels)
         if self._tokenizer is None:
             self._tokenizer = self._read_tokenizer()
-        tokens, last = self._tokenizer.tokens(words)
-        device = self._place.device
+        tokens = self._tokenizer.of(words)
+        last = tokens["attention_mask"].sum(dim=1) - 1
         with torch.inference_mode():
-            found = self._network.text(tokens.to(device), last.to(device)).float()
-            found = F.normalize(found, dim=-1).cpu()
+            found = F.normalize(self._network.text(tokens["input_ids"], last).float(), dim=-1).cpu()
         return found.clone()
 
-    def _read_tokenizer(self) -> Tokenizer:
-        text = self._network.text
-        return Tokenizer(
-            tokenizer_folder(self._options.tokenizer, self._place.folder),
-            vocabulary=int(text.tokens.num_embeddings),
-            context=len(text.positions),
+    def _read_tokenizer(self) -> Tokens:
+        text, place = self._network.text, self._place
+        place = replace(place, folder=tokenizer_folder(self._options.tokenizer, place.folder))
+        tokens = Tokens(
+            place, None, longest=len(text.positions), kind="CLIPTokenizer", padding_side="right"
         )
+        known = int(text.tokens.num_embeddings)
+        if len(tokens) != known:
+            raise FileFormatError(
+                f"{place.folder}: expected a vocabulary of {known} tokens, as the weights have, "
+                f"got {len(tokens)}."
+            )
+        return tokens
 
     @override
     @torch.inference_mode()

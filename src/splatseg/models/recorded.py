@@ -98,7 +98,7 @@ class RecordedModel(ABC):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class RecordedMasks(RecordedModel):
+class RecordedMaskModel(RecordedModel):
     """Recorded evidence with masks: automatic, and promptable by choice among them."""
 
     def masks(self, image: Image, *, view: str | None = None) -> MaskSet:
@@ -286,7 +286,7 @@ def recorded_words(evidence: FeatureEvidence) -> TextEmbeddings | None:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class RecordedLabels(RecordedMasks):
+class RecordedLabels(RecordedMaskModel):
     """Recorded label maps whose ids mean the same in all views."""
 
     @property
@@ -300,7 +300,7 @@ class RecordedLabels(RecordedMasks):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class RecordedPanoptic(RecordedMasks):
+class RecordedPanoptic(RecordedMaskModel):
     """Recorded segments with their classes."""
 
     evidence: PanopticEvidence | AnnotationEvidence
@@ -319,7 +319,7 @@ class RecordedPanoptic(RecordedMasks):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class RecordedTracks(RecordedMasks):
+class RecordedTracks(RecordedMaskModel):
     """Recorded tracks: the label maps of a tracker, in the order it went."""
 
     def track(
@@ -409,7 +409,7 @@ def recorded_model(
 _MODELS: dict[EvidenceKind, type[RecordedModel]] = {
     "depth": RecordedDepth,
     "labels": RecordedLabels,
-    "masks": RecordedMasks,
+    "masks": RecordedMaskModel,
     "panoptic": RecordedPanoptic,
     "tracked": RecordedTracks,
 }

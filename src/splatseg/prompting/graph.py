@@ -43,11 +43,10 @@ from jaxtyping import Bool, Float, Int64
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splatseg._check import check_values
+from splatseg._check import check_shape, check_values
 from splatseg.core import Gaussians, Selection
 from splatseg.core.boundary import boundary
 from splatseg.core.options import Count
-from splatseg.errors import ShapeError
 from splatseg.lift.completion.graph import (
     NodeAttributes,
     flat_normals,
@@ -155,14 +154,6 @@ class NeighbourGraph:
             touching=self.touching[torch.from_numpy(entries)],
         )
 
-    def check(self, name: str, values: Tensor) -> None:
-        """Raise `ShapeError` unless `values` has one row a Gaussian."""
-        if len(values) != len(self):
-            raise ShapeError(
-                f"{name}: expected {len(self)} rows, those of the graph's Gaussians, "
-                f"got {len(values)}."
-            )
-
 
 @boundary
 def build_graph(gaussians: Gaussians, *, neighbours: Count = _NEIGHBOURS) -> NeighbourGraph:
@@ -200,13 +191,12 @@ def build_graph(gaussians: Gaussians, *, neighbours: Count = _NEIGHBOURS) -> Nei
     )
 
 
-@boundary
 def holes(graph: NeighbourGraph, selection: Selection) -> Selection:
     """Gaussians that are not selected and lie in holes of the selection.
 
     ``selection | holes(graph, selection)`` has none.
     """
-    graph.check("selection", selection.mask)
+    check_shape("selection", selection.mask, (len(graph),))
     mask = selection.mask.cpu()
     filled = torch.zeros_like(mask)
     if not selection.count or selection.count == len(selection):
@@ -258,7 +248,6 @@ def _small_pieces(
         reached[further] = True
 
 
-@boundary
 def specks(
     graph: NeighbourGraph, selection: Selection, *, clicked: Selection | None = None
 ) -> Selection:
@@ -270,9 +259,9 @@ def specks(
         clicked: Gaussians that a person pointed at: a piece that holds one is no speck. None, or
             none of them selected, keeps the largest piece.
     """
-    graph.check("selection", selection.mask)
+    check_shape("selection", selection.mask, (len(graph),))
     if clicked is not None:
-        graph.check("clicked", clicked.mask)
+        check_shape("clicked", clicked.mask, (len(graph),))
     mask = selection.mask.cpu()
     found = torch.zeros_like(mask)
     rows = torch.nonzero(mask).squeeze(1)
@@ -291,7 +280,6 @@ def specks(
     return Selection(mask=found)
 
 
-@boundary
 def complete_membership(
     graph: NeighbourGraph, membership: Float[Tensor, "n"], hidden: Bool[Tensor, "n"]
 ) -> Float[Tensor, "n"]:
@@ -306,8 +294,8 @@ def complete_membership(
         The memberships, with those of hidden Gaussians the share that arrived; 0 where only hidden
         and unlikely ones are around.
     """
-    graph.check("membership", membership)
-    graph.check("hidden", hidden)
+    check_shape("membership", membership, (len(graph),))
+    check_shape("hidden", hidden, (len(graph),))
     unknown = hidden.cpu()
     values = torch.where(unknown, 0.0, membership.detach().cpu().double())
     check_values("membership", values, 0.0, 1.0)
@@ -342,7 +330,6 @@ def _near_members(graph: NeighbourGraph, member: Tensor, hidden: Tensor) -> Int6
     return torch.nonzero(reached).squeeze(1)
 
 
-@boundary
 def graph_cut(
     graph: NeighbourGraph,
     membership: Float[Tensor, "n"],
@@ -363,7 +350,7 @@ def graph_cut(
         its neighbours are on; more than 0.5 for exactly those that are in. Outside the band it is
         the membership given.
     """
-    graph.check("membership", membership)
+    check_shape("membership", membership, (len(graph),))
     check_values("membership", membership, 0.0, 1.0)
     p = membership.detach().cpu().double().clone()
     held = torch.zeros(len(p), dtype=torch.bool)

@@ -19,7 +19,7 @@ of all views is asked for, at its pixel farthest from its rim (Sofiiuk et al., R
 Training with Mask Guidance for Interactive Segmentation, 2021).
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, cast
 
@@ -29,10 +29,10 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splatseg._check import check_values
+from splatseg._check import check_shape, check_values
 from splatseg.core import Camera, Gaussians, Selection, View, camera_of_map
 from splatseg.core.boundary import boundary
-from splatseg.errors import InputError, ShapeError
+from splatseg.errors import InputError
 from splatseg.render import render
 
 Mask = NDArray[np.bool_]
@@ -111,12 +111,16 @@ def next_click(
     Returns:
         The click, or None where nothing is uncertain.
     """
-    _check(gaussians, views, membership, {"clicked": clicked, "rejected": rejected})
+    if not views:
+        raise InputError("views: expected at least one that may be clicked in, got none.")
+    check_shape("membership", membership, (len(gaussians),))
+    check_values("membership", membership, 0.0, 1.0)
     p = membership.detach().to(gaussians.means)
     wrong = torch.minimum(p, 1 - p)
     signal = torch.stack((p, wrong, torch.zeros_like(p), torch.zeros_like(p)), dim=1)
     for channel, pointed_at in ((2, clicked), (3, rejected)):
         if pointed_at is not None:
+            check_shape("clicked or rejected", pointed_at.mask, (len(gaussians),))
             signal[:, channel] = pointed_at.mask.to(signal)
     # A signal is rendered without colours; none are evaluated or checked then.
     plain = gaussians.replace(sh=gaussians.sh[:, :1])
@@ -135,22 +139,6 @@ def next_click(
             if best is None or click.expected_error > best.expected_error:
                 best = click
     return best
-
-
-def _check(
-    gaussians: Gaussians,
-    views: Sequence[View],
-    membership: Tensor,
-    selections: Mapping[str, Selection | None],
-) -> None:
-    if len(membership) != len(gaussians):
-        raise ShapeError(f"membership: expected {len(gaussians)} rows, got {len(membership)}.")
-    check_values("membership", membership, 0.0, 1.0)
-    for name, selection in selections.items():
-        if selection is not None and len(selection) != len(gaussians):
-            raise ShapeError(f"{name}: expected {len(gaussians)} rows, got {len(selection)}.")
-    if not views:
-        raise InputError("views: expected at least one that may be clicked in, got none.")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

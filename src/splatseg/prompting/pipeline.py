@@ -33,7 +33,6 @@ from torch import Tensor
 
 from splatseg._check import check_values
 from splatseg.core import Gaussians, LabelMap, Selection, View
-from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, ShapeError
 from splatseg.lift.mass.segment_masses import view_masses
 from splatseg.neighbours import NeighbourIndex, Subset
@@ -186,7 +185,6 @@ class SelectionContext:
         return Selection(mask=mask)
 
 
-@boundary
 def statistical_filter(
     index: NeighbourIndex,
     members: Bool[Tensor, "n"],
@@ -236,7 +234,6 @@ def growth_radius(subset: Subset, quantile: float) -> float:
     return float(np.partition(nearest, rank)[rank]) * (1 + _ROUNDING)
 
 
-@boundary
 def region_grow(
     index: NeighbourIndex,
     seeds: Bool[Tensor, "n"],
@@ -261,7 +258,6 @@ def region_grow(
     return Subset(index, seeds | candidates).connected(seeds, radius)
 
 
-@boundary
 def ball_grow(
     index: NeighbourIndex,
     members: Bool[Tensor, "n"],

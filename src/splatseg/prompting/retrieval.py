@@ -118,11 +118,6 @@ class StoredFeatures:
         scales = 0 if self.scales is None else self.scales.nbytes
         return self.panels.nbytes + scales
 
-    def unpacked(self) -> Float32[Tensor, "n d"]:
-        """The features as they are stored, rounding included."""
-        rows = self.panels.transpose(1, 2).reshape(-1, self.channels)[: self.rows].float()
-        return rows if self.scales is None else rows * self.scales.unsqueeze(1)
-
 
 @boundary
 def scores(

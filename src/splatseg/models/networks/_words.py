@@ -126,19 +126,25 @@ class Tokens:
         place: The weights.
         config: The network's, as the library has it: it says which tokenizer goes with it.
         longest: Most tokens that the network takes, those of begin and end included.
+        **more: For the library's tokenizer.
 
     Raises:
         FileFormatError: If there is none, or it cannot be read.
     """
 
-    def __init__(self, place: Loading, config: Any, *, longest: int) -> None:
+    def __init__(self, place: Loading, config: Any, *, longest: int, **more: Any) -> None:
         folder = self._folder = place.folder
-        self._tokenizer = load_tokenizer(folder, config)
+        self._tokenizer = load_tokenizer(folder, config, **more)
         self._longest = longest
         self._known = getattr(getattr(config, "text_config", None), "vocab_size", None)
         self._device = place.device
         self.digest = _digest(folder)
         """SHA-256 over the tokenizer's files."""
+
+    def __len__(self) -> int:
+        """Tokens that it knows."""
+        with self._reading():
+            return len(self._tokenizer)
 
     def of(self, texts: Sequence[str], *, padded_to: int | None = None) -> dict[str, Any]:
         """Numbers of texts, as long as the longest of them.
@@ -205,15 +211,14 @@ class Tokens:
         return refused_by_library(self._folder, _EXPECTED)
 
 
-def load_tokenizer(folder: Path, config: Any) -> Any:
+def load_tokenizer(folder: Path, config: Any, *, kind: str = "AutoTokenizer", **more: Any) -> Any:
     """The library's tokenizer of a folder of weights.
 
     Args:
         folder: The weights.
-        config: The network's, as the library has it; it reads config.json itself without.
-
-    Raises:
-        FileFormatError: If there is none, or it cannot be read.
+        config: The network's, as the library has it; None where the kind says what it is.
+        kind: Class of the library.
+        **more: For that class.
     """
     if not any((folder / name).is_file() for name in _VOCABULARIES):
         raise FileFormatError(
@@ -223,8 +228,9 @@ def load_tokenizer(folder: Path, config: Any) -> Any:
     for path in sorted(folder.glob("tokenizer*.json")):
         _check_growth(path)
     with offline(), refused_by_library(folder, _EXPECTED):
-        return library().AutoTokenizer.from_pretrained(
-            folder, config=config, local_files_only=True, trust_remote_code=False
+        known = {} if config is None else {"config": config, "trust_remote_code": False}
+        return getattr(library(), kind).from_pretrained(
+            folder, local_files_only=True, **known, **more
         )
 
 

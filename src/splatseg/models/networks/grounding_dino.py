@@ -17,7 +17,7 @@ from splatseg.core.models import Boxes, Image, Prompt, TextMasks
 from splatseg.core.options import Share, options
 from splatseg.errors import InputError
 from splatseg.models._images import Frame, Normalisation, frame_of, input_side
-from splatseg.models._mask_generator import Candidates, distinct
+from splatseg.models._mask_generator import distinct
 from splatseg.models._registry import own_family
 from splatseg.models._weights import Loading, second_loading
 from splatseg.models.networks._library import NetworkModel, configuration, network
@@ -193,10 +193,7 @@ def _one_a_thing(corners: Float[Tensor, "n 4"], score: Float[Tensor, "n"], word:
     kept: list[Tensor] = []
     for one in word.unique():
         of_word = (word == one).nonzero()[:, 0]
-        found = Candidates(
-            logits=corners[of_word, None], scores=score[of_word], boxes=corners[of_word]
-        )
-        kept.append(of_word[distinct(found, MAX_OVERLAP)])
+        kept.append(of_word[distinct(corners[of_word], score[of_word], MAX_OVERLAP)])
     index = torch.cat(kept).sort().values if kept else torch.zeros(0, dtype=torch.int64)
     return index[torch.sort(score[index], descending=True, stable=True).indices]
 
