@@ -117,8 +117,8 @@ def see(
         model: The model; or the name of one, or a file or folder of evidence recorded elsewhere.
         evidence: Name of the evidence to write.
         options: What is asked.
-        model_options: Options of the model's family, such as `ClassicalOptions` of ``classical``; None
-            takes its defaults.
+        model_options: Options of the model's family, such as `ClassicalOptions`; None takes its
+            defaults.
         loading: The model's weights, and where and how it runs.
         backend: Who renders views without photographs.
         observer: Is told of the progress.
