@@ -51,7 +51,7 @@ from splatseg.io.evidence import open_evidence
 from splatseg.io.scene import load_scene, load_scene_layer
 from splatseg.lift import uplift
 from splatseg.lift.mass.segment_masses import view_masses
-from splatseg.prompting.feature_source import FeatureSource, FeatureSourceOptions
+from splatseg.prompting.feature_source import FeatureMembership, FeatureMembershipOptions
 from splatseg.prompting.prompts import ViewPrompt
 from splatseg.tasks import SelectOptions, open_selector
 from splatseg.tasks.select_options import SelectPostProcessing, SelectThreshold
@@ -83,7 +83,7 @@ class Bench:
         self.session = open_selector(self.scene, options=self.options, source=self._source())
         self.seconds: list[float] = []
 
-    def _source(self) -> FeatureSource | None:
+    def _source(self) -> FeatureMembership | None:
         """Features with a threshold of their own, where one is asked for."""
         args = self.args
         if args.threshold is None:
@@ -91,8 +91,8 @@ class Bench:
         layer = load_scene_layer(args.scene, args.layer)
         if not isinstance(layer, Features):
             raise SystemExit(f"{args.layer}: thresholds are of features")
-        options = FeatureSourceOptions(threshold=args.threshold)
-        return FeatureSource(layer, self.scene.gaussians, options=options)
+        options = FeatureMembershipOptions(threshold=args.threshold)
+        return FeatureMembership(layer, self.scene.gaussians, options=options)
 
     def select(self, prompts: Sequence[ViewPrompt], **changes: Any) -> Any:
         """What prompts select; nothing where the source has no answer."""

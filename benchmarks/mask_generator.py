@@ -17,8 +17,7 @@ from typing import Any
 import torch
 
 from splatseg.models import LoadOptions, find_model
-from splatseg.models._mask_generator import candidates, distinct, grid_points
-from splatseg.models.networks.sam import SamOptions
+from splatseg.models._mask_generator import SamOptions, candidates, distinct, grid_points
 
 
 def tiny(folder: Path, *, full: bool) -> Path:
@@ -59,7 +58,7 @@ def main() -> None:
         encoded = time.perf_counter()
         found = candidates(decode, grid_points(options.points_per_side, 426, 640), options)
         prompted = time.perf_counter()
-        kept = distinct(found, options.max_overlap)
+        kept = distinct(found.boxes, found.scores, options.max_overlap)
         masks = model.masks(image)  # the encoder's answer is kept, the prompts are asked again
         done = time.perf_counter()
     asked = prompted - encoded

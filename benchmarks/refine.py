@@ -26,13 +26,12 @@ from splatseg.core import Selection
 from splatseg.io.evidence import open_evidence
 from splatseg.io.scene import load_scene
 from splatseg.lift import uplift
-from splatseg.prompting.graph import NeighbourGraph, build_graph
-from splatseg.prompting.holes import holes, specks
+from splatseg.prompting.graph import NeighbourGraph, build_graph, graph_cut, holes, specks
 from splatseg.prompting.next_click import next_click
-from splatseg.prompting.refine import refine
 from splatseg.render.cpu import set_threads
 
 SIZES = range(300, 20_001)
+NOBODY = torch.zeros(0, dtype=torch.int64)
 T = TypeVar("T")
 
 
@@ -84,11 +83,10 @@ def main() -> None:
         mask = damaged(graph, truth, seed=id)
         p = torch.where(mask, 0.9, 0.1)
         found["iou damaged"].append(overlap(mask, truth))
-        refined, ms = timed(lambda p=p: refine(graph, p))
+        refined, ms = timed(lambda p=p: graph_cut(graph, p, inside=NOBODY, outside=NOBODY))
         found["ms refine"].append(ms)
-        found["band"].append(len(refined.band))
-        found["iou refined"].append(overlap(refined.mask, truth))
-        selection = Selection(mask=refined.mask)
+        found["iou refined"].append(overlap(refined > 0.5, truth))
+        selection = Selection(mask=refined > 0.5)
         filled, ms = timed(lambda s=selection: s | holes(graph, s))
         found["ms holes"].append(ms)
         found["iou filled"].append(overlap(filled.mask, truth))
@@ -96,7 +94,7 @@ def main() -> None:
         found["ms specks"].append(ms)
         found["iou clean"].append(overlap(clean.mask, truth))
         if len(sizes) % 8 == 1:
-            unsure = refined.confidence
+            unsure = refined
             _, ms = timed(lambda p=unsure: next_click(gaussians, views, p))
             found["ms next click"].append(ms)
     nearest = min(range(len(sizes)), key=lambda i: abs(sizes[i] - 7000))

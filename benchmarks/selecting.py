@@ -31,9 +31,14 @@ from torch import Tensor
 from splatseg import _native
 from splatseg.io.scene import load_scene
 from splatseg.neighbours import NeighbourIndex, Subset
-from splatseg.prompting.filtering import FilterOptions, statistical_filter
-from splatseg.prompting.growing import GrowOptions, ball_grow, growth_radius, region_grow
-from splatseg.prompting.retrieval import StoredFeatures, mean_threshold, retrieve, scores
+from splatseg.prompting.pipeline import (
+    REGION_QUANTILE,
+    ball_grow,
+    growth_radius,
+    region_grow,
+    statistical_filter,
+)
+from splatseg.prompting.retrieval import StoredFeatures, mean_threshold, scores
 
 CHANNELS = 32
 PRECISIONS = ("float32", "float16", "int8")
@@ -121,18 +126,17 @@ def retrieval_rows(
         found = scores(stored["float32"], queries)
         threshold = max(mean_threshold(found), 0.65)
         calls: dict[str, Callable[[], Any]] = {
-            p: lambda s=s, q=queries, t=threshold: retrieve(s, q, threshold=t)
-            for p, s in stored.items()
+            p: lambda s=s, q=queries, t=threshold: scores(s, q) > t for p, s in stored.items()
         }
         calls["numpy"] = lambda u=unit, t=threshold: numpy_retrieval(normal.numpy(), u.numpy(), t)
         calls["torch"] = lambda u=unit, t=threshold: (normal @ u.T).amax(dim=1) > t
         times = alternate(calls, repeats, threads)
-        exact = retrieve(stored["float32"], queries, threshold=threshold).mask
+        exact = scores(stored["float32"], queries) > threshold
         hits = int(exact.sum())
         for side, took in times.items():
             flipped = share = size = "-"
             if side in stored:
-                mask = retrieve(stored[side], queries, threshold=threshold).mask
+                mask = scores(stored[side], queries) > threshold
                 flipped = f"{int((mask != exact).sum()) / hits:.3%}"
                 moved = stored[side].nbytes + 5 * len(target)  # read; score and mask written
                 size = f"{stored[side].nbytes / 1e6:.0f}"
@@ -141,7 +145,7 @@ def retrieval_rows(
                 f"| {name} | {count} | {side} | {took} | {size} | {share} | {flipped} |", flush=True
             )
         if count == 4:
-            result = retrieve(stored["float16"], queries, threshold=threshold).mask
+            result = scores(stored["float16"], queries) > threshold
     return result
 
 
@@ -174,24 +178,25 @@ def space_rows(
     index = NeighbourIndex(points)
     k = 32
     filtered = statistical_filter(index, retrieved)
-    radius = growth_radius(index, filtered)
+    radius = growth_radius(Subset(index, filtered), REGION_QUANTILE)
     rows, kept = retrieved.nonzero()[:, 0].numpy(), filtered.nonzero()[:, 0].numpy()
     seeds = target & retrieved & (torch.arange(len(points)) % 10 == 0)
-    published = FilterOptions.published()
     calls: dict[str, Callable[[], Any]] = {
         "subset of the index": lambda: Subset(index, retrieved),
         "filter, k = 32": lambda: statistical_filter(index, retrieved),
         "region growing from a tenth": lambda: region_grow(index, seeds, retrieved),
-        "ball growing": lambda: ball_grow(index, filtered),
-        "ball growing, published radius": lambda: ball_grow(
-            index, filtered, GrowOptions.published()
+        "ball growing": lambda: ball_grow(index, filtered, quantile=REGION_QUANTILE),
+        "ball growing, published radius": lambda: ball_grow(index, filtered, quantile=1.0),
+        "filter + ball growing": lambda: ball_grow(
+            index, statistical_filter(index, retrieved), quantile=REGION_QUANTILE
         ),
-        "filter + ball growing": lambda: ball_grow(index, statistical_filter(index, retrieved)),
     }
     for side, took in alternate(calls, repeats, threads).items():
         print(f"| {name} | {side} | splatseg | {took} |", flush=True)
     slow: dict[str, Callable[[], Any]] = {
-        "filter, k = sqrt(n) | splatseg": lambda: statistical_filter(index, retrieved, published),
+        "filter, k = sqrt(n) | splatseg": lambda: statistical_filter(
+            index, retrieved, max_neighbours=None
+        ),
         "filter, k = 32 | NeighbourIndex of the members": lambda: own_index(
             index, points, retrieved, k
         ),
@@ -202,13 +207,11 @@ def space_rows(
     for side, took in alternate(slow, 1, threads).items():
         print(f"| {name} | {side} | {took} |", flush=True)
     same = np.array_equal(scipy_filter(wide, rows, k, threads), kept)
-    after = int(ball_grow(index, filtered).sum())
-    grown = np.array_equal(
-        scipy_grow(wide, kept, 0.99, threads), ball_grow(index, filtered).numpy()
-    )
+    balls = ball_grow(index, filtered, quantile=REGION_QUANTILE)
+    grown = np.array_equal(scipy_grow(wide, kept, REGION_QUANTILE, threads), balls.numpy())
     print(
         f"\n{name}: {len(rows)} retrieved, {len(kept)} after filtering, "
-        f"{after} after growing by {radius:.4f}; filter as scipy's: "
+        f"{int(balls.sum())} after growing by {radius:.4f}; filter as scipy's: "
         f"{same}, growing as scipy's: {grown}; index {index.nbytes / 1e6:.0f} MB\n"
     )
 

@@ -17,7 +17,7 @@ from splatseg.io.evidence import evidence_header, open_evidence
 from splatseg.io.json_files import read_json, write_json
 from splatseg.io.scene import load_scene
 from splatseg.io.scene_folder import CHECKPOINT_FILE, scene_lock
-from splatseg.models import record_evidence
+from splatseg.models import EvidenceRequest, record_evidence
 from splatseg.models.classical import Classical
 
 SEE = ("--model", "classical", "--evidence", "masks")
@@ -92,10 +92,10 @@ def test_old_evidence_stays_until_the_new_is_complete(small, splatseg, ending) -
 
     views = load_scene(small.scene, data=small.capture).train_views
     with pytest.raises(ending):
-        record_evidence(Classical(), views, folder, overwrite=True, progress=stop)
+        record_evidence(Classical(), views, folder, EvidenceRequest(overwrite=True), progress=stop)
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
     assert (folder.parent / ".splatseg-see-masks").is_dir()
-    seen = record_evidence(Classical(), views, folder, overwrite=True)
+    seen = record_evidence(Classical(), views, folder, EvidenceRequest(overwrite=True))
     assert seen.kept == 2, "it goes on"
     assert [path.name for path in folder.parent.iterdir()] == ["masks"]
     assert sorted(path.name for path in folder.iterdir()) == sorted(before)

@@ -19,7 +19,7 @@ from splatseg.io.evidence import (
     save_masks,
 )
 from splatseg.io.scene import load_scene
-from splatseg.models import record_evidence
+from splatseg.models import EvidenceRequest, record_evidence
 from support.shared import generated_and
 
 WIDTH, HEIGHT = 28, 20
@@ -296,7 +296,7 @@ def test_panoptic_segments_are_kept_over_a_stop(small) -> None:
         assert [s.category for s in evidence.segments(name)] == [4, 5]
         assert evidence.label_map(name).ids.unique().tolist() == [1, 2]
     assert not list(folder.rglob(".*"))
-    record_evidence(model, scene.views, folder, asked="all")
+    record_evidence(model, scene.views, folder, EvidenceRequest(view_spec="all"))
     assert len(open_evidence(folder).segments("train_0")) == 2, "the table keeps older views"
 
 
@@ -495,7 +495,7 @@ def test_a_folder_cannot_be_copied_onto_itself(small, splatseg, recorded) -> Non
     assert see(splatseg, small, recorded)[0] == 0
     own = small.scene / "evidence" / "x"
     sentence = refused(see(splatseg, small, own, "--overwrite"))
-    assert "another folder than the recorded evidence itself" in sentence
+    assert "another folder than that of the evidence that is read" in sentence
     assert open_evidence(own).view_names == TRAIN
 
 

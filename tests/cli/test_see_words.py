@@ -95,7 +95,7 @@ def test_the_command_of_two_networks(small, checkpoints, splatseg) -> None:
         "see", small.scene, "--model", "langsam", "--weights", checkpoints("grounding_dino"),
         "--sam-model", "sam-hq", "--sam-weights", checkpoints("sam_hq"), "--evidence", "found",
         "--words", "chair", "table", "--box-threshold", "0", "--text-threshold", "0",
-        "--max-overlap", "0.9", "--what", "panoptic,masks",
+        "--what", "panoptic,masks",
     )  # fmt: skip
     assert status == 0, err
     assert out.startswith("panoptic of 3 views by langsam, ")

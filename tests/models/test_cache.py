@@ -11,6 +11,7 @@ import torch
 from splatseg.core import DeepFeatures, Embedding, FeatureMap, LabelMap, MaskSet, Panoptic, Segment
 from splatseg.errors import InputError, RangeError
 from splatseg.models import ModelCache
+from splatseg.models._cache import METHODS
 
 
 @dataclass
@@ -89,29 +90,29 @@ def flat(answer: Any) -> list[Any]:
     return [answer.model, answer.height, answer.width, answer.view, arrays]
 
 
-ASKED = ["masks", "label_map", "panoptic", "features", "text_features", "embed"]
+ASKED = ["masks", "labels", "panoptic", "features", "text", "embedding"]
 
 
 @pytest.mark.parametrize("what", ASKED)
 def test_a_second_question_is_answered_from_disk_with_the_same(cache, what) -> None:
     model = Counting()
-    first = getattr(cache, what)(model, picture())
+    first = cache.ask(what, model, picture())
     asked = model.asked
-    second = getattr(ModelCache(folder=cache.folder), what)(Counting(), picture())
+    second = ModelCache(folder=cache.folder).ask(what, Counting(), picture())
     assert flat(second) == flat(first)
-    getattr(cache, what)(model, picture())
+    cache.ask(what, model, picture())
     assert model.asked == asked
-    direct = getattr(Counting(), what)(picture())
-    if what in ("masks", "label_map", "panoptic"):
+    direct = getattr(Counting(), METHODS[what])(picture())
+    if what in ("masks", "labels", "panoptic"):
         assert flat(first) == flat(direct), "only floats of features are rounded"
 
 
 def test_features_are_rounded_no_more_than_their_precision_says(tmp_path) -> None:
     direct = Counting().text_features(picture()).features
-    half = ModelCache(folder=tmp_path / "half").text_features(Counting(), picture()).features
+    half = ModelCache(folder=tmp_path / "half").ask("text", Counting(), picture()).features
     assert float((half - direct).abs().max()) <= 2**-10
     whole = ModelCache(folder=tmp_path / "int8", precision="int8")
-    eighth = whole.text_features(Counting(), picture()).features
+    eighth = whole.ask("text", Counting(), picture()).features
     span = direct.reshape(-1, 5).max(0).values - direct.reshape(-1, 5).min(0).values
     assert bool(((eighth - direct).abs() <= span / 254 / 2 + 1e-6).all())
     assert not torch.equal(eighth, half)
@@ -127,7 +128,7 @@ def test_int8_keeps_constant_channels_and_needs_less_room(tmp_path, rng) -> None
     sizes = {}
     for precision in ("float16", "int8"):
         cache = ModelCache(folder=tmp_path / precision, precision=precision)
-        given = cache.text_features(Wide(), picture()).features
+        given = cache.ask("text", Wide(), picture()).features
         assert torch.equal(given[..., 3], torch.full((32, 32), 7.25))
         assert cache.size().entries == 1
         sizes[precision] = cache.size().bytes
@@ -175,15 +176,15 @@ def test_a_damaged_entry_is_named_and_computed_again(cache, damage) -> None:
     told: list[str] = []
     cache = ModelCache(folder=cache.folder, report=told.append)
     model = Counting()
-    first = cache.masks(model, picture())
+    first = cache.ask("masks", model, picture())
     path = cache.entry("masks", model, picture())
     path.write_bytes(damage(path.read_bytes()))
-    again = cache.masks(model, picture())
+    again = cache.ask("masks", model, picture())
     assert (flat(again), model.asked) == (flat(first), 2)
     assert len(told) == 1
     assert told[0].startswith(f"{path}: ")
     assert told[0].endswith("the entry is computed again.")
-    cache.masks(model, picture())
+    cache.ask("masks", model, picture())
     assert (model.asked, len(told)) == (2, 1), "the new entry is whole"
 
 
@@ -196,12 +197,12 @@ def test_a_whole_entry_with_other_content_is_damaged_too(cache) -> None:
     told: list[str] = []
     cache = ModelCache(folder=cache.folder, report=told.append)
     model = Counting()
-    cache.masks(model, picture())
+    cache.ask("masks", model, picture())
     path = cache.entry("masks", model, picture())
     payload = zstandard.ZstdCompressor().compress(b"no archive")
     head = path.read_bytes().split(b"\n")[0] + b"\n"
     path.write_bytes(head + hashlib.sha256(payload).digest() + payload)
-    cache.masks(model, picture())
+    cache.ask("masks", model, picture())
     assert model.asked == 2
     assert "does not hold what a model gives" in told[0]
 
@@ -209,9 +210,9 @@ def test_a_whole_entry_with_other_content_is_damaged_too(cache) -> None:
 def test_a_model_that_fails_leaves_nothing_behind(cache) -> None:
     model = Counting(scale=float("nan"))
     with pytest.raises(RangeError, match="features: .* not finite"):
-        cache.text_features(model, picture())
+        cache.ask("text", model, picture())
     with pytest.raises(RangeError, match="as float16"):
-        cache.text_features(Counting(scale=1e6), picture())
+        cache.ask("text", Counting(scale=1e6), picture())
     assert cache.size().entries == 0
     assert not list(cache.folder.rglob("*")) or all(p.is_dir() for p in cache.folder.rglob("*"))
 

@@ -21,19 +21,16 @@ from splatseg.core import (
     TextFeatures,
 )
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.models import find_model
+from splatseg.models import _regions, classical, find_model
+from splatseg.models._merge_tree import merge_tree, pixel_features
+from splatseg.models._regions import _enlarged
 from splatseg.models.classical import (
     Classical,
-    DescriptorOptions,
-    GrabCutOptions,
-    RegionOptions,
+    ClassicalOptions,
     colour_gradient_features,
     partition,
     region_masks,
 )
-from splatseg.models.classical._boundary import pixel_features
-from splatseg.models.classical._merge_tree import merge_tree
-from splatseg.models.classical._regions import _enlarged
 
 
 def truth(shape: tuple[int, int], rows: slice, columns: slice) -> torch.Tensor:
@@ -80,7 +77,7 @@ def test_a_level_merges_what_is_alike_before_what_is_not(squares) -> None:
     image[20:76, 64:98] = torch.tensor([165, 60, 50], dtype=torch.uint8)
     both = truth((96, 128), slice(20, 76), slice(30, 98))
     left = truth((96, 128), slice(20, 76), slice(30, 64))
-    masks = region_masks(image, RegionOptions(cuts=(0.3, 1.0)))
+    masks = region_masks(image, ClassicalOptions(cuts=(0.3, 1.0)))
     level = {
         name: {
             int(masks.levels[i]) for i in range(len(masks)) if iou(masks.dense(i), wanted) > 0.85
@@ -91,7 +88,7 @@ def test_a_level_merges_what_is_alike_before_what_is_not(squares) -> None:
 
 
 def test_masks_are_nested_and_levels_come_back_as_partitions(squares) -> None:
-    masks = region_masks(squares, RegionOptions(min_area=0.0, cuts=(0.03, 0.1, 0.3)))
+    masks = region_masks(squares, ClassicalOptions(min_area=0.0, cuts=(0.03, 0.1, 0.3)))
     dense = [masks.dense(i) for i in range(len(masks))]
     for i, a in enumerate(dense):
         for b in dense[i + 1 :]:
@@ -108,13 +105,17 @@ def test_masks_are_nested_and_levels_come_back_as_partitions(squares) -> None:
         coarser = ids
 
 
-def test_masks_keep_the_photographs_size_and_outline(squares) -> None:
+def test_masks_keep_the_photographs_size_and_outline(squares, monkeypatch) -> None:
     """Worked on at half the size, masks are the image's own size and still fit."""
-    masks = region_masks(squares, RegionOptions(working_size=64, superpixel_size=5))
+    monkeypatch.setattr(_regions, "WORKING_SIZE", 64)
+    monkeypatch.setattr(_regions, "SUPERPIXEL_SIZE", 5)
+    masks = region_masks(squares)
     assert (masks.height, masks.width) == (96, 128)
     assert best(masks, BLUE) > 0.75
     assert best(masks, RED & ~BLUE) > 0.8
-    odd = region_masks(squares[:95, :127], RegionOptions(working_size=50))
+    monkeypatch.setattr(_regions, "WORKING_SIZE", 50)
+    monkeypatch.setattr(_regions, "SUPERPIXEL_SIZE", 9)
+    odd = region_masks(squares[:95, :127])
     assert (odd.height, odd.width) == (95, 127)
 
 
@@ -132,16 +133,16 @@ def test_enlarged_borders_are_straight_and_labels_stay_labels() -> None:
 
 
 def test_small_masks_are_dropped(squares) -> None:
-    everything = region_masks(squares, RegionOptions(min_area=0.0))
+    everything = region_masks(squares, ClassicalOptions(min_area=0.0))
     share = 0.05
-    kept = region_masks(squares, RegionOptions(min_area=share))
+    kept = region_masks(squares, ClassicalOptions(min_area=share))
     areas = [m.area for m in everything.masks]
     assert min(m.area for m in kept.masks) >= share * 96 * 128
     assert len(kept) == sum(a >= share * 96 * 128 for a in areas) < len(everything)
 
 
 def test_scores_rank_an_object_above_its_fragments(squares) -> None:
-    masks = region_masks(squares, RegionOptions(cuts=(0.01, 0.3)))
+    masks = region_masks(squares, ClassicalOptions(cuts=(0.01, 0.3)))
     assert bool(((masks.scores >= 0) & (masks.scores <= 1)).all())
     score = {}
     for i in range(len(masks)):
@@ -247,7 +248,7 @@ def test_the_cost_of_two_regions_is_the_formula_of_the_docstring() -> None:
 )
 def test_settings_of_regions_that_make_no_sense(wrong) -> None:
     with pytest.raises(InputError, match=next(iter(wrong))):
-        RegionOptions(**wrong)
+        ClassicalOptions(**wrong)
 
 
 # GrabCut
@@ -289,9 +290,10 @@ def test_a_rough_mask_is_refined(embedded) -> None:
     assert iou(found, BLUE) > max(0.85, iou(rough, BLUE))
 
 
-def test_prompts_refer_to_the_photographs_pixels(squares) -> None:
+def test_prompts_refer_to_the_photographs_pixels(squares, monkeypatch) -> None:
     """Worked on at half the size, the same box means the same thing."""
-    model = Classical(regions=RegionOptions(working_size=64))
+    monkeypatch.setattr(classical, "WORKING_SIZE", 64)
+    model = Classical()
     embedding = model.embed(squares)
     assert embedding.arrays["image"].shape == (48, 64, 3)
     found = model.prompted_masks(embedding, Prompt(box=torch.tensor([48.0, 36.0, 80.0, 60.0])))
@@ -333,10 +335,6 @@ def test_prompts_that_make_no_sense(embedded) -> None:
         model.prompted_masks(embedding, Prompt(box=torch.tensor([300.0, 5.0, 400.0, 9.0])))
     with pytest.raises(ShapeError, match="mask"):
         model.prompted_masks(embedding, Prompt(mask=torch.ones(4, 4, dtype=torch.bool)))
-    with pytest.raises(InputError, match="cut_rounds"):
-        GrabCutOptions(cut_rounds=0)
-    with pytest.raises(InputError, match="point_radius"):
-        GrabCutOptions(point_radius=0.5)
 
 
 # Descriptor
@@ -370,17 +368,13 @@ def test_features_tell_the_direction_of_a_texture() -> None:
 
 
 def test_cells_cover_images_of_any_size(squares) -> None:
-    deep = colour_gradient_features(squares[:93, :50], DescriptorOptions(cell_size=8))
+    deep = colour_gradient_features(squares[:93, :50])
     fine = deep.maps[0]
     assert fine.features.shape[:2] == (12, 7)
     assert (fine.height, fine.width) == (93, 50)
     assert bool(torch.isfinite(fine.features).all())
     whole = colour_gradient_features(squares[:, :56])
     assert torch.allclose(fine.features[:10, :5], whole.maps[0].features[:10, :5], atol=0.05)
-    with pytest.raises(InputError, match="cell_size"):
-        DescriptorOptions(cell_size=0)
-    with pytest.raises(InputError, match="reaches"):
-        DescriptorOptions(reaches=())
 
 
 # The model
@@ -397,8 +391,15 @@ def test_the_model_of_the_name_classical_says_what_it_is() -> None:
         assert not isinstance(model, protocol)
 
 
-def test_settings_change_with_every_option() -> None:
+def test_settings_change_with_every_option_and_are_those_of_earlier_versions() -> None:
     settings = Classical().settings
-    assert Classical(regions=RegionOptions(min_area=0.01)).settings != settings
-    assert Classical(cut=GrabCutOptions(cut_rounds=2)).settings != settings
-    assert Classical(descriptor=DescriptorOptions(cell_size=4)).settings != settings
+    assert Classical(regions=ClassicalOptions(min_area=0.01)).settings != settings
+    assert settings == {
+        "algorithm": 1,
+        "regions": {
+            "working_size": 640, "superpixel_size": 9, "cuts": [0.16, 0.25, 0.36, 0.5],
+            "min_area": 0.0005,
+        },
+        "cut": {"cut_rounds": 5, "point_radius": 0.012},
+        "descriptor": {"cell_size": 8, "reaches": [1.0, 3.0]},
+    }  # fmt: skip

@@ -5,8 +5,7 @@ import json
 import pytest
 
 from splatseg.errors import FileFormatError
-from splatseg.models._images import Normalisation
-from splatseg.models._input_size import InputSize
+from splatseg.models._images import InputSize, Normalisation
 
 PUBLISHED = InputSize(shortest=800, longest=1333, multiple=32)
 

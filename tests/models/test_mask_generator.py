@@ -4,10 +4,11 @@ import pytest
 import torch
 
 from splatseg.core.models import Image
-from splatseg.errors import RangeError
+from splatseg.errors import InputError
+from splatseg.models import _mask_generator
 from splatseg.models._mask_generator import (
     Candidates,
-    MaskGeneratorOptions,
+    SamOptions,
     _crops,
     automatic_masks,
     distinct,
@@ -17,7 +18,7 @@ from splatseg.models._mask_generator import (
     stability,
 )
 
-OPTIONS = MaskGeneratorOptions(points_per_side=4, prompts_per_batch=3)
+OPTIONS = SamOptions(points_per_side=4)
 
 
 def disc(size: int, x: float, y: float, radius: float, *, soft: float = 40.0) -> torch.Tensor:
@@ -50,9 +51,9 @@ def test_of_boxes_that_overlap_the_surest_stays() -> None:
     boxes = torch.tensor([[0, 0, 1, 1], [0, 0, 1, 0.9], [0.5, 0.5, 1, 1], [0, 0, 1, 1.0]])
     scores = torch.tensor([0.8, 0.9, 0.7, 0.9])
     found = Candidates(logits=torch.zeros(4, 1, 1), scores=scores, boxes=boxes)
-    assert distinct(found, 0.7).tolist() == [1, 2], "the first of two equals"
-    assert distinct(found, 0.95).tolist() == [1, 3, 2]
-    assert distinct(found, 0.2).tolist() == [1]
+    assert distinct(found.boxes, found.scores, 0.7).tolist() == [1, 2], "the first of two equals"
+    assert distinct(found.boxes, found.scores, 0.95).tolist() == [1, 3, 2]
+    assert distinct(found.boxes, found.scores, 0.2).tolist() == [1]
 
 
 def test_levels_are_how_deep_a_mask_holds_others() -> None:
@@ -82,7 +83,8 @@ class Scripted:
         return decode
 
 
-def test_two_masks_are_kept_once_each_with_their_levels() -> None:
+def test_two_masks_are_kept_once_each_with_their_levels(monkeypatch) -> None:
+    monkeypatch.setattr(_mask_generator, "PROMPTS_PER_BATCH", 3)
     network = Scripted(disc(64, 20, 20, 6), disc(64, 24, 24, 18))
     found = automatic_masks(torch.zeros(128, 128, 3, dtype=torch.uint8), network, OPTIONS)
     assert network.batches == [3, 3, 3, 3, 3, 1]
@@ -98,24 +100,26 @@ def test_two_masks_are_kept_once_each_with_their_levels() -> None:
         ({}, 2),
         ({"min_iou": 0.92}, 1),
         ({"min_iou": 0.96}, 0),
-        ({"stability_offset": 60.0}, 0),  # a pixel and a half
-        ({"stability_offset": 60.0, "min_stability": 0.5}, 1),
-        ({"stability_offset": 60.0, "min_stability": 0.3}, 2),
+        ({"offset": 60.0}, 0),  # a pixel and a half
+        ({"offset": 60.0, "min_stability": 0.5}, 1),
+        ({"offset": 60.0, "min_stability": 0.3}, 2),
         ({"max_overlap": 0.05}, 1),
         ({"min_area": 0.1}, 1),
         ({"min_area": 0.5}, 0),
     ],
 )
-def test_each_option_counts(changes, kept) -> None:
+def test_each_option_counts(changes, kept, monkeypatch) -> None:
+    changes = dict(changes)
+    monkeypatch.setattr(_mask_generator, "STABILITY_OFFSET", changes.pop("offset", 1.0))
     network = Scripted(disc(64, 20, 20, 6), disc(64, 24, 24, 18))
-    options = MaskGeneratorOptions(points_per_side=2, **changes)
+    options = SamOptions(points_per_side=2, **changes)
     image = torch.zeros(64, 64, 3, dtype=torch.uint8)
     assert len(automatic_masks(image, network, options)) == kept
 
 
 def test_what_has_no_pixel_is_no_mask() -> None:
     network = Scripted(torch.full((8, 8), -5.0), disc(8, 4, 4, 3))
-    options = MaskGeneratorOptions(points_per_side=1, min_stability=0.0)
+    options = SamOptions(points_per_side=1, min_stability=0.0)
     assert len(automatic_masks(torch.zeros(8, 8, 3, dtype=torch.uint8), network, options)) == 1
 
 
@@ -150,8 +154,8 @@ def test_crops_find_what_is_small_and_leave_what_they_cut() -> None:
 
     image = torch.zeros(512, 512, 3, dtype=torch.uint8)
     image[60:90, 60:90] = 255  # in the first crop alone, 4 by 4 cells of the whole
-    whole = automatic_masks(image, decoder_of, MaskGeneratorOptions(points_per_side=1, min_iou=0.5))
-    crops = MaskGeneratorOptions(points_per_side=1, min_iou=0.5, crop_layers=1)
+    whole = automatic_masks(image, decoder_of, SamOptions(points_per_side=1, min_iou=0.5))
+    crops = SamOptions(points_per_side=1, min_iou=0.5, crop_layers=1)
     found = automatic_masks(image, decoder_of, crops)
     assert len(found) == 1
     assert abs(found.masks[0].area - 900) <= 200
@@ -166,15 +170,16 @@ def test_crops_find_what_is_small_and_leave_what_they_cut() -> None:
     "wrong",
     [
         {"points_per_side": 0},
-        {"prompts_per_batch": 0},
         {"crop_layers": 4},
         {"min_iou": 1.5},
         {"min_stability": -0.1},
         {"max_overlap": 2},
         {"min_area": -1},
-        {"stability_offset": -1},
+        {"stability_offset": 2.0},
+        {"prompts_per_batch": 9},
+        {"multimask": False},
     ],
 )
 def test_options_out_of_range(wrong) -> None:
-    with pytest.raises(RangeError, match=next(iter(wrong))):
-        MaskGeneratorOptions(**wrong)
+    with pytest.raises(InputError, match=next(iter(wrong))):
+        SamOptions(**wrong)

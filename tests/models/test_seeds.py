@@ -15,7 +15,7 @@ from splatseg.io.evidence import (
     save_tracks,
 )
 from splatseg.models import TrackingOptions
-from splatseg.models._seeds import Seeds, same_objects
+from splatseg.models._tracked import Seeds, same_objects
 
 CLASSES = ClassTable(rows=(ClassInfo(id=3, name="cup"), ClassInfo(id=4, name="desk")))
 

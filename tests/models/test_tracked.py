@@ -27,7 +27,13 @@ from splatseg.io.evidence import (
     save_segments,
     save_tracks,
 )
-from splatseg.models import ModelCache, TrackingOptions, find_model, record_evidence
+from splatseg.models import (
+    EvidenceRequest,
+    ModelCache,
+    TrackingOptions,
+    find_model,
+    record_evidence,
+)
 
 from .conftest import view_of
 
@@ -112,7 +118,10 @@ def labels(folder: Path, **maps: torch.Tensor):
 def followed(views, folder: Path, seeds, *, model=None, overwrite: bool = False, **options):
     model = model or ByColour()
     seen = record_evidence(
-        model, views, folder, seeds=seeds, tracking=TrackingOptions(**options), overwrite=overwrite
+        model,
+        views,
+        folder,
+        EvidenceRequest(seeds=seeds, tracking=TrackingOptions(**options), overwrite=overwrite),
     )
     return model, seen, open_evidence(folder)
 
@@ -341,16 +350,20 @@ def test_what_does_not_go_together(moving, masks, tmp_path) -> None:
         record_evidence(model, moving, tmp_path / "t")
     cache = ModelCache(folder=tmp_path / "c")
     with pytest.raises(InputError, match="cache: keeps answers to single photographs"):
-        record_evidence(model, moving, tmp_path / "t", seeds=masks, cache=cache)
+        record_evidence(model, moving, tmp_path / "t", EvidenceRequest(seeds=masks, cache=cache))
     for what in ("masks", ["tracked", "masks"]):
         with pytest.raises(InputError, match=r"what it gives \(tracked\), got 'masks'"):
-            record_evidence(model, moving, tmp_path / "t", seeds=masks, what=what)
+            record_evidence(model, moving, tmp_path / "t", EvidenceRequest(seeds=masks, what=what))
     with pytest.raises(InputError, match="seeds: expected with a tracker, got model 'classical'"):
-        record_evidence(find_model("classical"), moving, tmp_path / "t", seeds=masks)
+        record_evidence(
+            find_model("classical"), moving, tmp_path / "t", EvidenceRequest(seeds=masks)
+        )
     one = labels(tmp_path / "l", v0=torch.full((HEIGHT, WIDTH), -1), v9=torch.ones(2, 2))
     with pytest.raises(InputError, match="expected seeds in at least one of 2 views, got none"):
         followed(moving[:2], tmp_path / "t", one)
-    with pytest.raises(InputError, match="expected another folder than that of the seeds"):
+    with pytest.raises(
+        InputError, match="expected another folder than that of the evidence that is read"
+    ):
         followed(moving, masks.folder, masks)
     assert not (tmp_path / "t").exists()
     assert model.seen == []
@@ -362,12 +375,16 @@ def test_tracks_and_masks_are_asked_for_apart(moving, masks, tmp_path) -> None:
             return MaskSet.from_dense((image[..., 0] == RED[0])[None])
 
     with pytest.raises(InputError, match="what: expected tracked alone"):
-        record_evidence(Both(), moving, tmp_path / "t", seeds=masks, what=["tracked", "masks"])
+        record_evidence(
+            Both(), moving, tmp_path / "t", EvidenceRequest(seeds=masks, what=["tracked", "masks"])
+        )
     with pytest.raises(InputError, match="seeds: expected with a tracker"):
-        record_evidence(Both(), moving, tmp_path / "t", seeds=masks, what="masks")
-    seen = record_evidence(Both(), moving, tmp_path / "t", what="masks")
+        record_evidence(Both(), moving, tmp_path / "t", EvidenceRequest(seeds=masks, what="masks"))
+    seen = record_evidence(Both(), moving, tmp_path / "t", EvidenceRequest(what="masks"))
     assert (seen.kind, seen.masks) == ("masks", COUNT)
-    seen = record_evidence(Both(), moving, tmp_path / "u", what="tracked", seeds=masks)
+    seen = record_evidence(
+        Both(), moving, tmp_path / "u", EvidenceRequest(what="tracked", seeds=masks)
+    )
     assert seen.kind == "tracked"
 
 
@@ -435,9 +452,8 @@ def test_pictures_are_taken_one_at_a_time(moving, masks, tmp_path) -> None:
         assert len(taken) <= len(told), "none before its view is due"
         return load_image(view)
 
-    record_evidence(
-        ByColour(), moving, tmp_path / "t", seeds=masks, image_of=image_of,
-        progress=lambda done, count: told.append((done, count)),
-    )  # fmt: skip
+    request = EvidenceRequest(seeds=masks, image_of=image_of)
+    progress = lambda done, count: told.append((done, count))  # noqa: E731
+    record_evidence(ByColour(), moving, tmp_path / "t", request, progress=progress)
     assert taken == [f"v{i}" for i in range(COUNT)]
     assert told == [(i, COUNT) for i in range(COUNT + 1)]

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from splatseg.core import Camera, View
-from splatseg.models._view_order import ordered_views
+from splatseg.models._tracked import ordered_views
 
 
 def view(name: str, x: float, degrees: float = 0.0) -> View:

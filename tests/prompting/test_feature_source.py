@@ -1,7 +1,5 @@
 """Features as a source: queries, thresholds, gate, negatives, masks by 2D features."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 
@@ -9,7 +7,8 @@ from splatseg.core import FeatureMap, Features, LayerInfo
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.lift.affinity import AffinityHead
 from splatseg.lift.projector import projector_shapes
-from splatseg.prompting.feature_source import FeatureSource, FeatureSourceOptions
+from splatseg.prompting import feature_source
+from splatseg.prompting.feature_source import FeatureMembership, FeatureMembershipOptions
 from splatseg.prompting.prompts import ViewPrompt
 from splatseg.prompting.seen import see_prompts
 from support.wall import HEIGHT, SKY_ROWS, WIDTH, field_ids
@@ -37,8 +36,8 @@ UPPER_LEFT, LOWER_LEFT, UPPER_RIGHT = (10.5, 15.5), (10.5, 25.5), (25.5, 15.5)
 
 
 def test_what_is_like_the_click_is_found(gaussians, view, values) -> None:
-    source = FeatureSource(
-        Features(values=values), gaussians, options=FeatureSourceOptions(threshold=0.95)
+    source = FeatureMembership(
+        Features(values=values), gaussians, options=FeatureMembershipOptions(threshold=0.95)
     )
     found = source.membership(clicks(gaussians, view, UPPER_LEFT))
     assert torch.equal(found > 0.5, field_ids(gaussians) == 1)
@@ -48,16 +47,16 @@ def test_what_is_like_the_click_is_found(gaussians, view, values) -> None:
 
 def test_the_threshold_decides_how_much(gaussians, view, values) -> None:
     ids = field_ids(gaussians)
-    loose = FeatureSource(
-        Features(values=values), gaussians, options=FeatureSourceOptions(threshold=0.8)
+    loose = FeatureMembership(
+        Features(values=values), gaussians, options=FeatureMembershipOptions(threshold=0.8)
     )
     found = loose.membership(clicks(gaussians, view, UPPER_LEFT))
     assert torch.equal(found > 0.5, (ids == 1) | (ids == 3)), "cosine 1.2 / 1.36 = 0.88"
 
 
 def test_negative_points_take_away_what_is_more_like_them(gaussians, view, values) -> None:
-    source = FeatureSource(
-        Features(values=values), gaussians, options=FeatureSourceOptions(threshold=0.8)
+    source = FeatureMembership(
+        Features(values=values), gaussians, options=FeatureMembershipOptions(threshold=0.8)
     )
     found = source.membership(clicks(gaussians, view, UPPER_LEFT, negative=[LOWER_LEFT]))
     assert torch.equal(found > 0.5, field_ids(gaussians) == 1)
@@ -68,8 +67,8 @@ def test_the_threshold_of_points_is_the_mean_of_cosines(gaussians, view, values)
     longer = values * torch.linspace(1, 9, len(values))[:, None]
     ids = field_ids(gaussians)
     for some in (values, longer):
-        options = FeatureSourceOptions(rule="adaptive", threshold=1.0, precision="float32")
-        source = FeatureSource(Features(values=some), gaussians, options=options)
+        options = FeatureMembershipOptions(rule="adaptive", threshold=1.0)
+        source = FeatureMembership(Features(values=some), gaussians, options=options)
         found = source.membership(clicks(gaussians, view, UPPER_LEFT)) > 0.5
         assert torch.equal(found, (ids == 1) | (ids == 3))
 
@@ -79,8 +78,8 @@ def test_the_threshold_of_the_code_is_the_best_tenth_or_what_a_mask_shows(
 ) -> None:
     values = values + 0.02 * torch.from_numpy(rng.normal(size=values.shape)).float()
     ids = field_ids(gaussians)
-    options = FeatureSourceOptions(rule="code", precision="float32")
-    source = FeatureSource(Features(values=values), gaussians, options=options)
+    options = FeatureMembershipOptions(rule="code")
+    source = FeatureMembership(Features(values=values), gaussians, options=options)
     found = source.membership(clicks(gaussians, view, UPPER_LEFT)) > 0.5
     assert int(found.sum()) == len(values) // 10
     assert (ids[found] == 1).all()
@@ -102,7 +101,7 @@ def test_the_gate_of_the_granularity_is_used(gaussians, view) -> None:
         levels=(1.0, 0.5, 0.0),
     )
     layer = Features(values=values, info=LayerInfo(head=head.to_json()))
-    source = FeatureSource(layer, gaussians)
+    source = FeatureMembership(layer, gaussians)
     seen = clicks(gaussians, view, UPPER_LEFT)
     whole = source.membership(seen, granularity=0.5) > 0.5
     part = source.membership(seen, granularity=1.0) > 0.5
@@ -115,11 +114,11 @@ def test_the_gate_of_the_granularity_is_used(gaussians, view) -> None:
 def test_what_was_never_seen_is_out_and_said(gaussians, view, values) -> None:
     weights = torch.ones(len(values))
     weights[::3] = 0
-    source = FeatureSource(Features(values=values, weights=weights), gaussians)
+    source = FeatureMembership(Features(values=values, weights=weights), gaussians)
     assert source.unseen is not None
     assert torch.equal(source.unseen, weights == 0)
     assert not (source.membership(clicks(gaussians, view, UPPER_LEFT))[::3] > 0).any()
-    assert FeatureSource(Features(values=values), gaussians).unseen is None
+    assert FeatureMembership(Features(values=values), gaussians).unseen is None
 
 
 def region(rows: slice, columns: slice) -> torch.Tensor:
@@ -128,14 +127,17 @@ def region(rows: slice, columns: slice) -> torch.Tensor:
     return mask
 
 
-def test_a_mask_over_two_fields_asks_with_several_queries(gaussians, view, values) -> None:
+def test_a_mask_over_two_fields_asks_with_several_queries(
+    gaussians, view, values, monkeypatch
+) -> None:
     mask = region(slice(SKY_ROWS + 1, HEIGHT - 1), slice(0, 19))
     seen = see_prompts(gaussians, [ViewPrompt(view=view, mask=mask)])
     ids = field_ids(gaussians)
-    options = FeatureSourceOptions(threshold=0.99)
-    several = FeatureSource(Features(values=values), gaussians, options=options)
+    options = FeatureMembershipOptions(threshold=0.99)
+    several = FeatureMembership(Features(values=values), gaussians, options=options)
     assert torch.equal(several.membership(seen) > 0.5, (ids == 1) | (ids == 3))
-    one = FeatureSource(Features(values=values), gaussians, options=replace(options, clusters=1))
+    monkeypatch.setattr(feature_source, "_CLUSTERS", 1)
+    one = FeatureMembership(Features(values=values), gaussians, options=options)
     assert not (one.membership(seen) > 0.5).any(), "their mean is like neither"
 
 
@@ -167,14 +169,14 @@ def test_masks_asked_by_2d_features_are_products_above_mean_and_deviation(
     limit = products.mean() + products.std(correction=0)
     expected = products > limit
     assert torch.equal(expected, ids == 4), "not the field of the mask, which is shorter"
-    options = FeatureSourceOptions(rule="adaptive", precision="float32")
-    source = FeatureSource(layer, gaussians, options=options, guidance=same_everywhere)
+    options = FeatureMembershipOptions(rule="adaptive")
+    source = FeatureMembership(layer, gaussians, options=options, guidance=same_everywhere)
     found = source.membership(seen)
     assert torch.equal(found > 0.5, expected)
     assert float(found.max()) == pytest.approx(1.0)
     assert float(found.min()) == pytest.approx(0.0)
-    usual = FeatureSource(
-        layer, gaussians, options=FeatureSourceOptions(threshold=0.97), guidance=same_everywhere
+    usual = FeatureMembership(
+        layer, gaussians, options=FeatureMembershipOptions(threshold=0.97), guidance=same_everywhere
     )
     assert torch.equal(usual.membership(seen) > 0.5, ids == 2), "cosines by default"
     # A point beside it is compared by cosines, and both together mean both.
@@ -201,31 +203,18 @@ def test_masks_are_asked_by_2d_features_where_there_are_some(gaussians, view, va
 
     mask = region(slice(SKY_ROWS + 1, 19), slice(21, 34))
     seen = see_prompts(gaussians, [ViewPrompt(view=view, mask=mask)])
-    options = FeatureSourceOptions(threshold=0.97)
-    source = FeatureSource(layer, gaussians, options=options, guidance=guidance)
+    options = FeatureMembershipOptions(threshold=0.97)
+    source = FeatureMembership(layer, gaussians, options=options, guidance=guidance)
     assert torch.equal(source.membership(seen) > 0.5, field_ids(gaussians) == 2)
     assert asked == ["front"]
-
-
-def test_precisions_agree_but_for_the_last_bits(gaussians, view, values) -> None:
-    seen = clicks(gaussians, view, UPPER_LEFT)
-    found = [
-        FeatureSource(
-            Features(values=values), gaussians, options=FeatureSourceOptions(precision=precision)
-        ).membership(seen)
-        for precision in ("float32", "float16", "int8")
-    ]
-    assert not torch.equal(found[0], found[2])
-    torch.testing.assert_close(found[0], found[1], atol=2e-3, rtol=0)
-    torch.testing.assert_close(found[0], found[2], atol=2e-2, rtol=0)
 
 
 def test_the_seed_is_of_the_clusters(gaussians, view, rng) -> None:
     values = torch.from_numpy(rng.normal(size=(len(gaussians), 8))).float()
     seen = see_prompts(gaussians, [ViewPrompt(view=view, mask=region(slice(12, 28), slice(2, 33)))])
     found = [
-        FeatureSource(
-            Features(values=values), gaussians, options=FeatureSourceOptions(seed=seed)
+        FeatureMembership(
+            Features(values=values), gaussians, options=FeatureMembershipOptions(seed=seed)
         ).membership(seen)
         for seed in (0, 0, 5)
     ]
@@ -234,14 +223,14 @@ def test_the_seed_is_of_the_clusters(gaussians, view, rng) -> None:
 
 
 def test_nothing_with_a_feature_is_refused(gaussians, view, values) -> None:
-    source = FeatureSource(Features(values=torch.zeros_like(values)), gaussians)
+    source = FeatureMembership(Features(values=torch.zeros_like(values)), gaussians)
     with pytest.raises(InputError, match="features where the prompts are"):
         source.membership(clicks(gaussians, view, UPPER_LEFT))
 
 
 def test_features_of_another_scene_are_refused(gaussians, values) -> None:
     with pytest.raises(ShapeError, match="of another scene"):
-        FeatureSource(Features(values=values[1:]), gaussians)
+        FeatureMembership(Features(values=values[1:]), gaussians)
 
 
 @pytest.mark.parametrize(
@@ -249,4 +238,4 @@ def test_features_of_another_scene_are_refused(gaussians, values) -> None:
 )
 def test_options_out_of_range_are_refused(change) -> None:
     with pytest.raises((RangeError, InputError), match=next(iter(change))):
-        FeatureSourceOptions(**change)
+        FeatureMembershipOptions(**change)

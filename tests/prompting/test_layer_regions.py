@@ -2,7 +2,7 @@
 
 import torch
 
-from splatseg.prompting._layer_regions import _outlines, box_iou, outline
+from splatseg.prompting.tree_choice import _outlines, box_iou, outline
 
 
 def test_outlines_of_all_ids_are_those_of_each() -> None:

@@ -6,14 +6,15 @@ import torch
 
 from splatseg.core import Selection
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.prompting.image_regions import (
+from splatseg.prompting import next_click as module
+from splatseg.prompting.next_click import (
+    choose_views,
     detached_regions,
     enclosed_regions,
     largest_region,
+    next_click,
     without_regions,
 )
-from splatseg.prompting.next_click import NextClickOptions, next_click
-from splatseg.prompting.view_choice import choose_views
 from support.ball_rows import balls_at, grid, view_of
 
 VIEW = view_of()
@@ -21,7 +22,12 @@ POINTS = grid(21, 21, spacing=0.4) - torch.tensor([4.0, 4.0, 0.0])
 """From -4 to 4 in x and y, at z = 0."""
 
 WALL = balls_at(POINTS, scale=0.2)
-UNCERTAIN = NextClickOptions(hole_error=0, detached_error=0)
+
+
+@pytest.fixture
+def constant(monkeypatch):
+    """Set a constant of the module."""
+    return lambda name, value: monkeypatch.setattr(module, name, value)
 
 
 def membership(*patches) -> torch.Tensor:
@@ -65,7 +71,6 @@ def test_a_hole_is_asked_for_until_it_was_clicked() -> None:
     assert click.expected_error == pytest.approx(0.1 * click.area, rel=0.2)
     rejected = Selection(mask=POINTS.norm(dim=1) < 0.3)
     assert next_click(WALL, [VIEW], p, rejected=rejected) is None
-    assert next_click(WALL, [VIEW], p, options=NextClickOptions(hole_error=0)) is None
 
 
 def test_what_is_detached_from_the_click_is_asked_for() -> None:
@@ -80,26 +85,26 @@ def test_what_is_detached_from_the_click_is_asked_for() -> None:
     assert world_at(click.point)[0] < -1
     large = Selection(mask=(POINTS - torch.tensor([-2.0, 0, 0])).norm(dim=1) < 0.5)
     assert next_click(WALL, [VIEW], p, clicked=large | small) is None, "both were clicked"
-    assert next_click(WALL, [VIEW], p, options=NextClickOptions(detached_error=0)) is None
 
 
-def test_options_count() -> None:
+def test_constants_count(constant) -> None:
     p = membership((-1.5, 1.5, -1.5, 1.5, 0.15))
-    assert next_click(WALL, [VIEW], p, options=UNCERTAIN) is None
-    more = NextClickOptions(min_uncertainty=0.1)
-    click = next_click(WALL, [VIEW], p, options=more)
+    assert next_click(WALL, [VIEW], p) is None
+    constant("_MIN_UNCERTAINTY", 0.1)
+    click = next_click(WALL, [VIEW], p)
     assert click is not None
-    huge = NextClickOptions(min_uncertainty=0.1, min_area=2 * click.area)
-    assert next_click(WALL, [VIEW], p, options=huge) is None
-    coarse = NextClickOptions(min_uncertainty=0.1, longest=16)
-    reduced = next_click(WALL, [VIEW], p, options=coarse)
+    constant("_MIN_AREA", 2 * click.area)
+    assert next_click(WALL, [VIEW], p) is None
+    constant("_MIN_AREA", 20.0)
+    constant("_LONGEST", 16)
+    reduced = next_click(WALL, [VIEW], p)
     assert reduced is not None
     assert reduced.point == pytest.approx((32, 32), abs=4)
     assert reduced.point[0] % 4 == 2, "the centre of a pixel that is four of the view's"
     assert reduced.area == pytest.approx(click.area, rel=0.3)
 
 
-def test_of_several_views_the_one_that_shows_most() -> None:
+def test_of_several_views_the_one_that_shows_most(constant) -> None:
     p = membership((-1.5, 1.5, -1.5, 1.5, 0.5))
     views = [VIEW, view_of("near", at=4.0), view_of("aside", cx=-500.0)]
     click = next_click(WALL, views, p)
@@ -108,7 +113,8 @@ def test_of_several_views_the_one_that_shows_most() -> None:
     turned = next_click(WALL, views[::-1], p)
     assert turned is not None
     assert turned.point == click.point
-    only = next_click(WALL, views, p, options=NextClickOptions(max_views=1))
+    constant("_MAX_VIEWS", 1)
+    only = next_click(WALL, views, p)
     assert only is not None
     assert only.view.name == "front", "both show all of the weight, and the first is the first"
 
@@ -116,7 +122,7 @@ def test_of_several_views_the_one_that_shows_most() -> None:
 def test_a_lens_with_distortion_is_clicked_in_its_own_pixels() -> None:
     p = membership((1.5, 3.5, 1.5, 3.5, 0.5))
     lens = view_of(model="opencv", distortion=(-0.2,))
-    click = next_click(WALL, [lens], p, options=UNCERTAIN)
+    click = next_click(WALL, [lens], p)
     assert click is not None
     expected, _ = lens.camera.project(torch.tensor([[2.4, 2.4, 0.0]]))
     assert click.point == pytest.approx(tuple(expected[0].tolist()), abs=3)
@@ -169,22 +175,12 @@ def test_regions_of_an_image() -> None:
 
 def test_what_is_refused() -> None:
     p = membership()
-    with pytest.raises(ShapeError, match="membership: expected 441 rows"):
+    with pytest.raises(ShapeError, match=r"membership: expected shape \(441\)"):
         next_click(WALL, [VIEW], p[:3])
     with pytest.raises(RangeError, match="membership"):
         next_click(WALL, [VIEW], p + 1)
     with pytest.raises(InputError, match="views: expected at least one"):
         next_click(WALL, [], p)
     for name in ("clicked", "rejected"):
-        with pytest.raises(ShapeError, match=f"{name}: expected 441 rows, got 2"):
+        with pytest.raises(ShapeError, match=r"clicked or rejected: expected shape \(441\)"):
             next_click(WALL, [VIEW], p, **{name: Selection(mask=torch.ones(2, dtype=torch.bool))})
-    for wrong in (
-        {"max_views": 0},
-        {"longest": 0},
-        {"min_uncertainty": 0},
-        {"hole_error": 0.6},
-        {"detached_error": -1},
-        {"min_area": -1},
-    ):
-        with pytest.raises(RangeError, match=next(iter(wrong))):
-            NextClickOptions(**wrong)

@@ -1,6 +1,7 @@
 """Features against queries: the kernel and its reference, thresholds, what is refused."""
 
 import math
+from dataclasses import dataclass
 
 import pytest
 import torch
@@ -8,15 +9,39 @@ from torch import Tensor
 
 from splatseg import _native
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.prompting import reference
+from splatseg.prompting import retrieval
 from splatseg.prompting.retrieval import (
     StoredFeatures,
     deviation_threshold,
     mean_threshold,
     published_threshold,
-    retrieve,
     scores,
 )
+from support import retrieval as reference
+
+
+@dataclass
+class Retrieved:
+    mask: Tensor
+    positive: Tensor
+    negative: Tensor | None
+
+
+def retrieve(stored, asked, against=None, *, threshold, gate=None) -> Retrieved:
+    """Members in one pass of the kernel, which has what one needs for that."""
+    positive = retrieval._folded(stored, asked, gate)
+    negative = positive[:0] if against is None else retrieval._folded(stored, against, gate)
+    above, mask = torch.empty(len(stored)), torch.empty(len(stored), dtype=torch.uint8)
+    below = torch.empty(len(stored)) if len(negative) else None
+    squared = gate.square() if gate is not None and stored.similarity == "cosine" else None
+    half = stored.panels.dtype == torch.float16
+    panels = stored.panels.view(torch.int16) if half else stored.panels
+    _native.match_features(
+        panels, stored.rows, stored.scales, positive, negative, squared, threshold,
+        above, below, mask,
+    )  # fmt: skip
+    return Retrieved(mask.view(torch.bool), above, below)
+
 
 # Largest difference of a cosine that rounding of the stored features makes.
 LOSS = {"float32": 2e-6, "float16": 1e-3, "int8": 2e-2}
@@ -53,7 +78,9 @@ def test_the_kernel_rounds_only_as_the_features_are_stored(precision: str) -> No
     """Against the features as they are stored nothing is lost."""
     stored = StoredFeatures.of(random(300, 24, seed=3), precision=precision, similarity="dot")
     asked = random(6, 24, seed=4)
-    want = reference.scores(stored.unpacked(), asked, similarity="dot")
+    kept = stored.panels.transpose(1, 2).reshape(-1, 24)[:300].float()
+    kept = kept if stored.scales is None else kept * stored.scales.unsqueeze(1)
+    want = reference.scores(kept, asked, similarity="dot")
     torch.testing.assert_close(scores(stored, asked).double(), want, rtol=1e-5, atol=1e-5)
 
 
@@ -138,19 +165,21 @@ def test_threads_do_not_matter(threads: int) -> None:
         _native.set_threads(before)
 
 
-def test_thresholds_by_hand() -> None:
+def test_thresholds_by_hand(monkeypatch) -> None:
     found = torch.tensor([0.0, 0.2, 0.4, 0.6, 0.8])
     assert mean_threshold(found) == pytest.approx(0.4)
-    spread = 0.08**0.5
-    assert deviation_threshold(found) == pytest.approx(0.4 + spread)
-    assert deviation_threshold(found, deviations=2) == pytest.approx(0.4 + 2 * spread)
+    assert deviation_threshold(found) == pytest.approx(0.4 + 0.08**0.5)
     assert mean_threshold(found[:0]) == deviation_threshold(found[:0]) == 0
+    assert published_threshold(torch.arange(20.0), found[:0]) == 17, "the best tenth is above"
     low = torch.tensor([-0.5, -0.5])
-    assert published_threshold(found, low, top=0.4) == pytest.approx(0.4)
-    assert int((found > published_threshold(found, low, top=0.4)).sum()) == 2
-    assert published_threshold(found, torch.tensor([0.9, 0.9]), top=0.4) == pytest.approx(0.9)
-    assert published_threshold(-found, low, top=0.9) == 0
-    assert published_threshold(found, low, top=1.0) == 0
+    monkeypatch.setattr(retrieval, "_TOP", 0.4)
+    assert published_threshold(found, low) == pytest.approx(0.4)
+    assert int((found > published_threshold(found, low)).sum()) == 2
+    assert published_threshold(found, torch.tensor([0.9, 0.9])) == pytest.approx(0.9)
+    monkeypatch.setattr(retrieval, "_TOP", 0.9)
+    assert published_threshold(-found, low) == 0
+    monkeypatch.setattr(retrieval, "_TOP", 1.0)
+    assert published_threshold(found, low) == 0
 
 
 def test_what_is_refused() -> None:
@@ -172,13 +201,7 @@ def test_what_is_refused() -> None:
         scores(stored, values[:, :2])
     with pytest.raises(ShapeError, match="at least one"):
         scores(stored, values[:0])
-    with pytest.raises(ShapeError, match="at least one"):
-        retrieve(stored, values[:0], threshold=0)
     with pytest.raises(ShapeError, match="gate"):
         scores(stored, values, gate=torch.ones(2))
     with pytest.raises(RangeError, match="gate"):
         scores(stored, values, gate=torch.tensor([1.0, math.inf, 0]))
-    with pytest.raises(RangeError, match="threshold"):
-        retrieve(stored, values, threshold=math.nan)
-    with pytest.raises(RangeError, match="top"):
-        published_threshold(values[:, 0], values[:, 0], top=0)

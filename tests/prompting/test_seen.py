@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from splatseg.errors import InputError, RangeError
+from splatseg.prompting import seen as seen_module
 from splatseg.prompting.prompts import ViewPrompt
-from splatseg.prompting.seen import PromptOptions, see_prompts, thinned
-from splatseg.prompting.view_cache import ViewCache
+from splatseg.prompting.seen import ViewCache, see_prompts, thinned
 from splatseg.render import weights
 
 
@@ -43,18 +43,18 @@ def test_points_are_the_rows_of_their_pixels(gaussians, view, side) -> None:
 
 def test_masks_are_thinned_and_lit_and_say_where_the_thing_is(gaussians, view) -> None:
     mask = LEFT | SKY
-    options = PromptOptions(max_pixels=50, seed=3)
-    (seen,) = see_prompts(gaussians, [ViewPrompt(view=view, mask=mask)], options=options)
+    options = {"max_pixels": 50, "seed": 3}
+    (seen,) = see_prompts(gaussians, [ViewPrompt(view=view, mask=mask)], **options)
     assert 10 < len(seen) <= 50
     assert seen.dense
     assert seen.positive.all()
     assert torch.equal(seen.inside, mask)
     columns, rows = seen.pixels.unbind(1)
     assert LEFT[rows, columns].all(), "pixels of the sky show nothing"
-    (again,) = see_prompts(gaussians, [ViewPrompt(view=view, mask=mask)], options=options)
+    (again,) = see_prompts(gaussians, [ViewPrompt(view=view, mask=mask)], **options)
     assert torch.equal(again.pixels, seen.pixels)
-    other = PromptOptions(max_pixels=50, seed=4)
-    (another,) = see_prompts(gaussians, [ViewPrompt(view=view, mask=mask)], options=other)
+    other = {"max_pixels": 50, "seed": 4}
+    (another,) = see_prompts(gaussians, [ViewPrompt(view=view, mask=mask)], **other)
     assert another.pixels.tolist() != seen.pixels.tolist()
 
 
@@ -121,7 +121,7 @@ def test_what_cannot_be_answered(gaussians, view, fields, says) -> None:
 
 
 def test_points_of_two_views_on_the_same_gaussians_contradict_each_other(
-    gaussians, view, side
+    gaussians, view, side, monkeypatch
 ) -> None:
     """The wall is at z = 2 and the cameras half a unit apart: five pixels."""
     prompts = [
@@ -130,24 +130,17 @@ def test_points_of_two_views_on_the_same_gaussians_contradict_each_other(
     ]
     with pytest.raises(InputError, match="in view front and .* in view side, which contradict"):
         see_prompts(gaussians, prompts)
-    # As many as are shared are allowed by `max_overlap`.
-    assert see_prompts(gaussians, prompts, options=PromptOptions(max_overlap=1.0))
+    monkeypatch.setattr(seen_module, "_MAX_OVERLAP", 1.0)
+    assert see_prompts(gaussians, prompts)
 
 
-def test_what_counts_as_sky_is_an_option(gaussians, view) -> None:
-    faint = replace(gaussians, opacities=torch.full((len(gaussians),), 0.03))
+def test_what_counts_as_sky(gaussians, view) -> None:
     prompt = ViewPrompt(view=view, points=[[10, 20]])
-    assert see_prompts(faint, [prompt])
+    assert see_prompts(replace(gaussians, opacities=torch.full((len(gaussians),), 0.03)), [prompt])
     with pytest.raises(InputError, match="the sky"):
-        see_prompts(faint, [prompt], options=PromptOptions(min_alpha=0.2))
-
-
-@pytest.mark.parametrize("field", ["min_alpha", "max_overlap"])
-def test_options_have_their_ranges(field) -> None:
-    with pytest.raises(RangeError, match=field):
-        PromptOptions(**{field: 1.5})
-    with pytest.raises(RangeError, match="max_pixels: expected 1 or more"):
-        PromptOptions(max_pixels=0)
+        see_prompts(replace(gaussians, opacities=torch.full((len(gaussians),), 0.005)), [prompt])
+    with pytest.raises(RangeError, match="max_pixels: expected at least 1"):
+        see_prompts(gaussians, [prompt], max_pixels=0)
 
 
 def test_views_are_kept_and_used_again(gaussians, view, side) -> None:

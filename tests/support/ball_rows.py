@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from splatseg.core import Camera, Gaussians, View
-from splatseg.prompting.graph import GraphOptions, NeighbourGraph, build_graph
+from splatseg.prompting.graph import NeighbourGraph, build_graph
 
 _SH_0 = 0.28209479177387814
 
@@ -47,9 +47,9 @@ def row_of(count: int, *, colours: Tensor | None = None) -> Gaussians:
     return balls_at(grid(count), colours=colours)
 
 
-def graph_of(gaussians: Gaussians, neighbours: int = 2, **options: float) -> NeighbourGraph:
+def graph_of(gaussians: Gaussians, neighbours: int = 2) -> NeighbourGraph:
     """Their neighbour graph."""
-    return build_graph(gaussians, options=GraphOptions(neighbours=neighbours, **options))
+    return build_graph(gaussians, neighbours=neighbours)
 
 
 def view_of(name: str = "front", *, at: float = 0.0, size: int = 64, **camera: float) -> View:

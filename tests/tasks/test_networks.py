@@ -17,8 +17,7 @@ from splatseg.io.captures import read_capture
 from splatseg.io.evidence import open_evidence, save_depth_map
 from splatseg.io.scene import load_scene
 from splatseg.models import LoadOptions
-from splatseg.models._queries import SemanticOptions
-from splatseg.models.networks.segmenters import SegmenterOptions
+from splatseg.models.networks.segmenters import SegmenterOptions, SemanticOptions
 from splatseg.tasks import MakeSceneOptions, SeeOptions, SegmentOptions, fit_capture, see, segment
 from splatseg.tasks._depth_evidence import with_depth_evidence
 from splatseg.tasks._observer import SILENT

@@ -17,6 +17,7 @@ from splatseg.models import (
     TrackingOptions,
     find_family,
     model_names,
+    model_summary,
 )
 from splatseg.tasks import SeeOptions, see
 
@@ -185,11 +186,9 @@ def _weights(family: ModelFamily) -> str:
 
 def _with_summaries() -> type[Any]:
     """The command without a model, whose help lists the models."""
-    rows: list[str] = []
-    for name in model_names():
-        family = find_family(name)
-        rows.append(f"- {name}: {'of another package' if family is None else family.summary}")
-    text = "\n".join(rows)
+    text = "\n".join(
+        f"- {name}: {model_summary(name) or 'of another package'}" for name in model_names()
+    )
     return _made(
         [_NO_OPTIONS, _HIDDEN_LOADING, *_NO_TRACKING], f"{Command.__doc__}\n\nModels:\n\n{text}"
     )

@@ -73,7 +73,7 @@ _REMOVED: dict[str, dict[str, str]] = {}
 
 
 def _made(cls: type[T], *, gone: dict[str, str]) -> type[T]:
-    check = cls.__dict__.get("__post_init__")
+    check = getattr(cls, "__post_init__", None)  # an inherited one, too
 
     def __post_init__(self: Any) -> None:
         convert_fields(self)

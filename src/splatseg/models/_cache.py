@@ -9,42 +9,46 @@ npz. It appears under its name only when it is complete.
 import hashlib
 import io
 import json
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, Literal, cast
 
 import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
 
-from splatseg._check import check_choice
-from splatseg.core import DepthMap, FeatureMap, LabelMap, MaskSet
-from splatseg.core.boundary import boundary, convert_fields
-from splatseg.core.models import (
-    AutomaticMasks,
-    DeepFeatures,
-    DenseDepth,
-    DenseFeatures,
-    Embedding,
-    Image,
-    Model,
-    Panoptic,
-    PanopticSegments,
-    PromptableMasks,
-    SemanticLabels,
-    TextFeatures,
-)
+from splatseg._check import check_finite
+from splatseg.core import DepthMap, FeatureMap, LabelMap, MaskSet, Rle, Segment
+from splatseg.core.boundary import convert_fields
+from splatseg.core.models import DeepFeatures, Embedding, Image, Model, Panoptic
 from splatseg.errors import InputError, reason
 from splatseg.io.arrays import open_npz
 from splatseg.io.atomic import atomic_file
 from splatseg.io.json_files import json_text, parse_object
-from splatseg.models._content import image_digest
-from splatseg.models._packing import Answer, Precision, pack, unpack
+from splatseg.models._images import image_digest
 
-_MAGIC = b"splatseg-cache 1\n"
+_MAGIC = b"splatseg-cache 2\n"
 _SUFFIX = ".entry"
 _DIGEST_BYTES = 32
 
-_A = TypeVar("_A", bound=Answer)
+_PARTS = (LabelMap, Panoptic, Segment, FeatureMap, DeepFeatures, DepthMap, Embedding)
+"""What answers are made of besides masks, tensors and plain values."""
+
+METHODS = {
+    "masks": "masks",
+    "panoptic": "panoptic",
+    "labels": "label_map",
+    "text": "text_features",
+    "features": "features",
+    "depth": "depth_map",
+    "embedding": "embed",
+}
+"""Method of a model that answers a question about an image."""
+
+_Precision = Literal["float16", "int8"]
+_Arrays = dict[str, NDArray[Any]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,10 +64,6 @@ class CacheSize:
         return f"{self.entries} entries, {self.bytes / scale:.1f} {unit}"
 
 
-def _silent(sentence: str) -> None:
-    """Where nobody listens."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModelCache:
     """Asks a model, or the disk where it was asked the same before.
@@ -75,48 +75,33 @@ class ModelCache:
     folder: Path
     """Made when it is not there; its parent must exist."""
 
-    precision: Precision = "float16"
+    precision: Literal["float16", "int8"] = "float16"
     """How features are kept: float16, or int8 with a scale per channel (half the size)."""
 
-    report: Callable[[str], None] = _silent
-    """Told in a sentence when an entry is damaged and is computed again."""
+    report: Callable[[str], None] = lambda _: None
+    """Called with a sentence when an entry is damaged and is computed again."""
 
-    @boundary
     def __post_init__(self) -> None:
         convert_fields(self)
-        check_choice("precision", self.precision, ("float16", "int8"))
         if self.folder.exists() and not self.folder.is_dir():
             raise InputError(f"{self.folder}: expected a folder for the cache, got a file.")
         if not self.folder.absolute().parent.is_dir():
             raise InputError(f"{self.folder}: expected a cache in a folder that is there.")
 
-    def masks(self, model: AutomaticMasks, image: Image) -> MaskSet:
-        """`AutomaticMasks.masks`."""
-        return self._ask("masks", model, image, lambda: model.masks(image))
-
-    def label_map(self, model: SemanticLabels, image: Image) -> LabelMap:
-        """`SemanticLabels.label_map`."""
-        return self._ask("labels", model, image, lambda: model.label_map(image))
-
-    def panoptic(self, model: PanopticSegments, image: Image) -> Panoptic:
-        """`PanopticSegments.panoptic`."""
-        return self._ask("panoptic", model, image, lambda: model.panoptic(image))
-
-    def features(self, model: DenseFeatures, image: Image) -> DeepFeatures:
-        """`DenseFeatures.features`."""
-        return self._ask("features", model, image, lambda: model.features(image))
-
-    def text_features(self, model: TextFeatures, image: Image) -> FeatureMap:
-        """`TextFeatures.text_features`."""
-        return self._ask("text", model, image, lambda: model.text_features(image))
-
-    def depth_map(self, model: DenseDepth, image: Image) -> DepthMap:
-        """`DenseDepth.depth_map`."""
-        return self._ask("depth", model, image, lambda: model.depth_map(image))
-
-    def embed(self, model: PromptableMasks, image: Image) -> Embedding:
-        """`PromptableMasks.embed`."""
-        return self._ask("embedding", model, image, lambda: model.embed(image))
+    def ask(self, what: str, model: Model, image: Image) -> Any:
+        """What a model gives for an image: its masks, or another of `METHODS`."""
+        path = self.entry(what, model, image)
+        if path.is_file():
+            try:
+                return _read(path)
+            except _DamagedError as error:
+                self.report(f"{path}: {error}; the entry is computed again.")
+        content = _encode(getattr(model, METHODS[what])(image), self.precision)
+        self.folder.mkdir(exist_ok=True)
+        path.parent.mkdir(exist_ok=True)
+        with atomic_file(path) as temporary:
+            temporary.write_bytes(content)
+        return _decode(content)
 
     def size(self) -> CacheSize:
         """Number and size of the entries."""
@@ -137,29 +122,16 @@ class ModelCache:
         name = hashlib.sha256(text.encode()).hexdigest()
         return self.folder / name[:2] / f"{name}{_SUFFIX}"
 
-    def _ask(self, what: str, model: Model, image: Image, compute: Callable[[], _A]) -> _A:
-        path = self.entry(what, model, image)
-        if path.is_file():
-            try:
-                return cast(_A, _read(path))
-            except _DamagedError as error:
-                self.report(f"{path}: {error}; the entry is computed again.")
-        content = _encode(compute(), self.precision)
-        self.folder.mkdir(exist_ok=True)
-        path.parent.mkdir(exist_ok=True)
-        with atomic_file(path) as temporary:
-            temporary.write_bytes(content)
-        return cast(_A, _decode(content))
-
 
 class _DamagedError(Exception):
     """An entry of the cache is not what was written."""
 
 
-def _encode(answer: Answer, precision: Precision) -> bytes:
+def _encode(answer: object, precision: _Precision) -> bytes:
     import zstandard
 
-    header, arrays = pack(answer, precision)
+    arrays: _Arrays = {}
+    header = _pack(answer, "", precision, arrays)
     text = np.frombuffer(json.dumps(header).encode(), np.uint8)
     buffer = io.BytesIO()
     np.savez(buffer, header=text, **cast(dict[str, Any], arrays))
@@ -167,14 +139,14 @@ def _encode(answer: Answer, precision: Precision) -> bytes:
     return _MAGIC + hashlib.sha256(payload).digest() + payload
 
 
-def _read(path: Path) -> Answer:
+def _read(path: Path) -> Any:
     try:
         return _decode(path.read_bytes())
     except OSError as error:
         raise _DamagedError(f"it cannot be read ({error})") from error
 
 
-def _decode(content: bytes) -> Answer:
+def _decode(content: bytes) -> Any:
     import zstandard
 
     if not content.startswith(_MAGIC):
@@ -189,6 +161,98 @@ def _decode(content: bytes) -> Answer:
         with open_npz(data, where="entry", expected="the arrays of an entry") as archive:
             arrays = {name: archive.array(name) for name in archive.names}
         header = parse_object(arrays.pop("header").tobytes(), where="header")
-        return unpack(header, arrays)
+        return _unpack(header, "", arrays)
     except (zstandard.ZstdError, LookupError, TypeError, ValueError) as error:
         raise _DamagedError(f"it does not hold what a model gives ({reason(error)})") from error
+
+
+def _pack(value: Any, at: str, precision: _Precision, arrays: _Arrays) -> Any:
+    """What JSON holds of an answer or a part of one; arrays go to `arrays`, by their place.
+
+    Floats become float16 as in evidence, those of feature maps as the precision says; scores of
+    masks stay as they are.
+    """
+    if isinstance(value, MaskSet):
+        counts = [mask.counts for mask in value.masks]
+        arrays[f"{at}counts"] = np.concatenate(counts) if counts else np.zeros(0, np.uint32)
+        arrays[f"{at}lengths"] = np.array([len(c) for c in counts], np.int64)
+        arrays[f"{at}scores"] = value.scores.cpu().numpy().astype(np.float32)
+        arrays[f"{at}levels"] = value.levels.cpu().numpy().astype(np.int32)
+        return {"type": "MaskSet", "height": value.height, "width": value.width}
+    if isinstance(value, Tensor):
+        name = at.removesuffix(".")
+        if value.is_floating_point():
+            features = name.rpartition(".")[2] == "features" and not name.startswith("arrays.")
+            _pack_floats(name, value, precision if features else "float16", arrays)
+        else:
+            arrays[name] = value.cpu().numpy()
+        return {"type": "Tensor"}
+    if isinstance(value, Mapping):
+        items = cast("Mapping[str, Any]", value).items()
+        packed = {name: _pack(one, f"{at}{name}.", precision, arrays) for name, one in items}
+        return {"type": "dict", "items": packed}
+    if isinstance(value, tuple):
+        parts = enumerate(cast("tuple[Any, ...]", value))
+        return [_pack(one, f"{at}{i}.", precision, arrays) for i, one in parts]
+    if not isinstance(value, _PARTS):
+        return value
+    return {"type": type(value).__name__} | {
+        one.name: _pack(getattr(value, one.name), f"{at}{one.name}.", precision, arrays)
+        for one in fields(value)
+    }
+
+
+def _unpack(header: Any, at: str, arrays: _Arrays) -> Any:
+    """Inverse of `_pack`, but for the precision of floats."""
+    if isinstance(header, list):
+        parts = enumerate(cast("list[Any]", header))
+        return tuple(_unpack(one, f"{at}{i}.", arrays) for i, one in parts)
+    if not isinstance(header, dict):
+        return header
+    known = dict(cast("dict[str, Any]", header))
+    kind = known.pop("type")
+    if kind == "Tensor":
+        return _unpack_floats(at.removesuffix("."), arrays)
+    if kind == "dict":
+        known = known["items"]
+    if kind == "MaskSet":
+        size = {"height": known["height"], "width": known["width"]}
+        ends = np.cumsum(arrays[f"{at}lengths"])
+        counts = np.split(arrays[f"{at}counts"], ends[:-1]) if len(ends) else []
+        return MaskSet(
+            **size,
+            masks=tuple(Rle(**size, counts=c) for c in counts),
+            scores=torch.from_numpy(arrays[f"{at}scores"]),
+            levels=torch.from_numpy(arrays[f"{at}levels"]),
+        )
+    values = {name: _unpack(one, f"{at}{name}.", arrays) for name, one in known.items()}
+    if kind == "dict":
+        return values
+    return next(part for part in _PARTS if part.__name__ == kind)(**values)
+
+
+def _pack_floats(key: str, values: Tensor, precision: _Precision, arrays: _Arrays) -> None:
+    """Floats as float16, or as int8 with a scale and an offset per channel (the last axis)."""
+    check_finite(key, values)
+    array = values.detach().cpu().numpy().astype(np.float32)
+    if precision == "float16":
+        half = values.detach().cpu().to(torch.float16)
+        check_finite(f"{key} as float16", half)
+        arrays[key] = half.numpy()
+        return
+    flat = array.reshape(-1, array.shape[-1])
+    flat = flat if len(flat) else np.zeros((1, array.shape[-1]), np.float32)
+    low, high = flat.min(0), flat.max(0)
+    scale = np.where(high > low, (high - low) / 254, 1).astype(np.float32)
+    offset = ((high + low) / 2).astype(np.float32)
+    arrays[key] = np.clip(np.rint((array - offset) / scale), -127, 127).astype(np.int8)
+    arrays[f"{key}.scale"], arrays[f"{key}.offset"] = scale, offset
+
+
+def _unpack_floats(key: str, arrays: _Arrays) -> Tensor:
+    values = arrays[key]
+    if f"{key}.scale" in arrays:
+        return torch.from_numpy(
+            values.astype(np.float32) * arrays[f"{key}.scale"] + arrays[f"{key}.offset"]
+        )
+    return torch.from_numpy(values.astype(np.float32) if values.dtype == np.float16 else values)

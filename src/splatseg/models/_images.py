@@ -1,9 +1,10 @@
-"""Photographs as networks take them: resized, normalised, padded; and their way back."""
+"""Photographs as networks take them: resized, normalised, padded; and what came of the last."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, Generic, Literal, TypeVar, cast
 
 import torch
 import torch.nn.functional as F
@@ -11,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatseg.core.models import Image
-from splatseg.errors import FileFormatError, quoted
+from splatseg.errors import BackendError, FileFormatError, quoted
 from splatseg.io.json_files import read_json
 
 IMAGENET = ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
@@ -20,6 +21,20 @@ IMAGENET = ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
 _MAX_SIDE = 1 << 14
 _SMALLEST_STD = 1e-3
 """Colours are divided by it."""
+
+
+_MULTIPLES = ("size_divisor", "size_divisibility", "ensure_multiple_of")
+"""What the multiple of sides is called in the files of the several networks."""
+
+_A = TypeVar("_A")
+
+
+def image_digest(image: Image) -> str:
+    """A digest of an image's size and pixels."""
+    array = image.detach().cpu().contiguous().numpy()
+    digest = hashlib.sha256(repr((array.shape, array.dtype.str)).encode())
+    digest.update(array.data)
+    return digest.hexdigest()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -31,31 +46,20 @@ class Normalisation:
 
     @classmethod
     def of(cls, folder: Path, otherwise: "Normalisation | None" = None) -> "Normalisation":
-        """The one that the weights' own settings for images say (`image_settings`).
-
-        Args:
-            folder: The weights.
-            otherwise: The one where it says none; None takes ImageNet's.
-
-        Raises:
-            FileFormatError: If it does not hold three numbers in range each.
-        """
+        """The one that the weights' own settings for images say, else ImageNet's or another."""
         known = cls() if otherwise is None else otherwise
-        path, content = image_settings(folder)
+        path, content = _image_settings(folder)
         return cls(
             mean=_three(path, content, "image_mean", known.mean),
             std=_three(path, content, "image_std", known.std, least=_SMALLEST_STD),
         )
 
 
-def image_settings(folder: Path) -> tuple[Path, dict[str, Any]]:
+def _image_settings(folder: Path) -> tuple[Path, dict[str, Any]]:
     """How weights want images, and the file that says so; nothing where none does.
 
     That is preprocessor_config.json, or a part of processor_config.json where newer programs wrote
     one file for images and words.
-
-    Raises:
-        FileFormatError: If the file is no JSON object.
     """
     path = folder / "preprocessor_config.json"
     if path.is_file():
@@ -72,24 +76,17 @@ def input_side(folder: Path, name: str, otherwise: int) -> int:
         folder: The weights.
         name: Which: ``height``, ``shortest_edge`` or ``longest_edge``.
         otherwise: The side where they say none.
-
-    Raises:
-        FileFormatError: If it is no whole number from 1 to 16384.
     """
-    path, content = image_settings(folder)
+    path, content = _image_settings(folder)
     size = content.get("size")
     value = cast("dict[str, Any]", size).get(name) if isinstance(size, dict) else None
     if value is None:
         return otherwise
-    return pixels(path, f"size: {name}", value)
+    return _pixels(path, f"size: {name}", value)
 
 
-def pixels(path: Path, name: str, value: object) -> int:
-    """A number of pixels that a file gives.
-
-    Raises:
-        FileFormatError: If it is no whole number from 1 to 16384.
-    """
+def _pixels(path: Path, name: str, value: object) -> int:
+    """A number of pixels that a file gives, from 1 to 16384."""
     if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= _MAX_SIDE:
         raise FileFormatError(
             f"{path}: {name}: expected a number of pixels up to {_MAX_SIDE}, got {quoted(value)}."
@@ -157,10 +154,7 @@ def frame_of(
             `size`; ``padded`` keeps them, below and to the right of the image is padding.
     """
     if shape == "square":
-        return Frame(
-            height=height, width=width, inner_height=size, inner_width=size,
-            outer_height=size, outer_width=size,
-        )  # fmt: skip
+        return _unpadded(height, width, (size, size))
     scale = size / max(height, width)
     if shape == "padded":
         inner = [max(1, int(side * scale + 0.5)) for side in (height, width)]
@@ -168,10 +162,14 @@ def frame_of(
             height=height, width=width, inner_height=inner[0], inner_width=inner[1],
             outer_height=size, outer_width=size,
         )  # fmt: skip
-    sides = [max(1, round(side * scale / multiple)) * multiple for side in (height, width)]
+    rows, columns = (max(1, round(s * scale / multiple)) * multiple for s in (height, width))
+    return _unpadded(height, width, (rows, columns))
+
+
+def _unpadded(height: int, width: int, inner: tuple[int, int]) -> Frame:
     return Frame(
-        height=height, width=width, inner_height=sides[0], inner_width=sides[1],
-        outer_height=sides[0], outer_width=sides[1],
+        height=height, width=width, inner_height=inner[0], inner_width=inner[1],
+        outer_height=inner[0], outer_width=inner[1],
     )  # fmt: skip
 
 
@@ -246,11 +244,8 @@ def patch_input(
     """Images of one size as a batch of whole patches; beyond the border the image is continued."""
     height, width = (int(side) for side in images[0].shape[:2])
     below, right = grid.rows * grid.stride - height, grid.columns * grid.stride - width
-    frame = Frame(
-        height=height + below, width=width + right,
-        inner_height=grid.rows * grid.patch, inner_width=grid.columns * grid.patch,
-        outer_height=grid.rows * grid.patch, outer_width=grid.columns * grid.patch,
-    )  # fmt: skip
+    inner = (grid.rows * grid.patch, grid.columns * grid.patch)
+    frame = _unpadded(height + below, width + right, inner)
     continued = [
         F.pad(image.permute(2, 0, 1).float()[None], (0, right, 0, below), mode="replicate")[0]
         .permute(1, 2, 0)
@@ -258,3 +253,160 @@ def patch_input(
         for image in images
     ]
     return network_input(continued, frame, normalisation, device=device, dtype=dtype, mode=mode)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InputSize:
+    """Sides of a network's input. Either `sides`, or `shortest` and `longest`."""
+
+    shortest: int | None = None
+    """Pixels of the shorter side, where the longer one does not become more than `longest`."""
+
+    longest: int | None = None
+    """The most pixels of the longer side."""
+
+    sides: tuple[int, int] | None = None
+    """Height and width, whatever the image's proportions are."""
+
+    keeps_proportions: bool = False
+    """With `sides`: the image is scaled so that one side fits, the one that changes it less."""
+
+    multiple: int = 1
+    """Sides are multiples of this."""
+
+    takes_squares: bool = False
+    """The network takes squares only: a size that the user says is both sides."""
+
+    @classmethod
+    def of(cls, folder: Path, *, otherwise: "InputSize") -> "InputSize":
+        """The one that the weights' preprocessor_config.json says.
+
+        Args:
+            folder: The weights.
+            otherwise: What holds where the file is not there or does not tell; a size of one
+                number is both sides where this has `sides`, else the shorter one.
+
+        Raises:
+            FileFormatError: If a size is no number of pixels.
+        """
+        path, content = _image_settings(folder)
+        if not content:
+            return otherwise
+        size = content.get("size")
+        multiple = otherwise.multiple
+        for name in _MULTIPLES:
+            if content.get(name):
+                multiple = _pixels(path, name, content[name])
+        if size is None:
+            return replace(otherwise, multiple=multiple, takes_squares=False)
+        given = cast(dict[str, Any], size) if isinstance(size, dict) else {}
+        numbers = {
+            key: _pixels(path, f"size {key}", value) for key, value in given.items() if value
+        }
+        if not isinstance(size, dict):
+            one = _pixels(path, "size", size)
+            square = otherwise.sides is not None
+            numbers = {"height": one, "width": one} if square else {"shortest_edge": one}
+            if not square and content.get("max_size"):
+                numbers["longest_edge"] = _pixels(path, "max_size", content["max_size"])
+        if "height" in numbers and "width" in numbers:
+            return cls(
+                sides=(numbers["height"], numbers["width"]),
+                keeps_proportions=content.get("keep_aspect_ratio") is True,
+                multiple=multiple,
+            )
+        if not numbers.keys() & {"shortest_edge", "longest_edge"}:
+            raise FileFormatError(
+                f"{path}: size: expected height and width or the shortest and longest edge, got "
+                f"{quoted(size)}."
+            )
+        return cls(
+            shortest=numbers.get("shortest_edge"),
+            longest=numbers.get("longest_edge"),
+            multiple=multiple,
+        )
+
+    def frame(self, height: int, width: int, *, size: int | None = None) -> Frame:
+        """How an image is laid into the input, without padding.
+
+        Args:
+            height: Rows of the image.
+            width: Columns of the image.
+            size: The longer side, where the user says it: the proportions are kept unless the
+                network takes squares.
+        """
+        if size is not None and not self.takes_squares:
+            return frame_of(height, width, size=size, multiple=self.multiple)
+        if size is not None:
+            inner = self._whole((size, size))
+            return frame_of(height, width, size=inner[0], shape="square")
+        if self.sides is not None and not self.keeps_proportions:
+            inner = self._whole(self.sides)
+        elif self.sides is not None:
+            scales = (self.sides[0] / height, self.sides[1] / width)
+            scale = min(scales, key=lambda one: abs(1 - one))
+            inner = self._whole((height * scale, width * scale))
+        else:
+            scale = (self.shortest or self.longest or 1) / min(height, width)
+            if self.longest is not None:
+                scale = min(scale, self.longest / max(height, width))
+                if self.shortest is None:
+                    scale = self.longest / max(height, width)
+            inner = self._whole((height * scale, width * scale))
+        return _unpadded(height, width, inner)
+
+    def _whole(self, sides: Sequence[float]) -> tuple[int, int]:
+        rows, columns = (max(1, int(side / self.multiple + 0.5)) * self.multiple for side in sides)
+        return rows, columns
+
+
+def is_lack_of_memory(error: BaseException) -> bool:
+    """Whether an error says that there is no memory for a tensor."""
+    return isinstance(error, torch.OutOfMemoryError | MemoryError) or (
+        isinstance(error, RuntimeError) and "allocate memory" in str(error)
+    )
+
+
+class LastImages(Generic[_A]):
+    """Encodes images, several at a time if they are announced, and keeps the last ones.
+
+    What is kept is found by the content of the image, so it changes no answer.
+    """
+
+    def __init__(
+        self, run: Callable[[Sequence[Image]], Sequence[_A]], *, resizable: bool = True
+    ) -> None:
+        """Keep what a network makes of images; a resizable one takes inputs of other sizes."""
+        self._run = run
+        self._resizable = resizable
+        self._kept: dict[str, _A] = {}
+
+    def encode(self, images: Sequence[Image]) -> None:
+        """Encode images of one size together; what was kept before is forgotten."""
+        digests = [image_digest(image) for image in images]
+        if all(digest in self._kept for digest in digests):
+            return
+        self._kept = {}  # before the run: the two together may not fit
+        self._kept = dict(zip(digests, self._fitting(images), strict=True))
+
+    def _fitting(self, images: Sequence[Image]) -> list[_A]:
+        """As many together as memory holds, half as many where they do not fit."""
+        try:
+            return list(self._run(images))
+        except (torch.OutOfMemoryError, MemoryError, RuntimeError) as error:
+            if not is_lack_of_memory(error):
+                raise
+            height, width = (int(side) for side in images[0].shape[:2])
+            if len(images) == 1:
+                smaller = "--size N makes it smaller for the network, " * self._resizable
+                raise BackendError(
+                    f"there is not enough memory for an image of {width}x{height}; {smaller}"
+                    "--dtype bfloat16 halves the network."
+                ) from error
+        half = len(images) // 2
+        return [*self._fitting(images[:half]), *self._fitting(images[half:])]
+
+    def of(self, image: Image) -> _A:
+        """What the network makes of an image."""
+        self.encode([image])
+        return self._kept[image_digest(image)]

@@ -8,16 +8,17 @@ coarse logits; only the masks that are left are brought to the size of the image
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
+from msgspec import Meta
 from torch import Tensor
 
 from splatseg.core import MaskSet, Rle
-from splatseg.core.boundary import convert_fields
 from splatseg.core.models import Image
-from splatseg.errors import RangeError
+from splatseg.core.options import Count, Share, options
 
 _OVERLAP = 512 / 1500
 """Of neighbouring crops, by the shorter side of the image: the published value."""
@@ -28,52 +29,48 @@ _BORDER = 20
 _COMPARED = 256
 """Longer side at which masks are compared for their levels."""
 
+STABILITY_OFFSET = 1.0
+"""How far the threshold is moved each way, logits: the published value."""
+
+PROMPTS_PER_BATCH = 64
+"""Points that the network answers together: 64 as published. Changes time and memory only."""
+
+CONTAINED = 0.9
+"""Share of a mask that lies in a larger one which contains it."""
+
 Decode = Callable[[Float[Tensor, "n 2"]], tuple[Float[Tensor, "n m h w"], Float[Tensor, "n m"]]]
 """Logits of m masks for each point (x, y in pixels of the image), over the image alone, at whatever
 size, and the IoU that the network expects of each."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MaskGeneratorOptions:
-    """Which masks are kept; the defaults are the published ones."""
+@options(
+    removed={
+        "multimask": "three masks a point are always made",
+        "stability_offset": f"the threshold moves by {STABILITY_OFFSET:g} each way, as published",
+        "prompts_per_batch": "it never changed a result",
+    }
+)
+class SamOptions:
+    """Which automatic masks are kept; the defaults are the published ones."""
 
-    points_per_side: int = 32
+    points_per_side: Count = 32
     """Points of the grid along each side of the image."""
 
-    min_iou: float = 0.88
+    min_iou: Share = 0.88
     """Least IoU that the network expects of a mask, in [0, 1]."""
 
-    min_stability: float = 0.95
+    min_stability: Share = 0.95
     """Least share, in [0, 1], of the mask at a lower threshold that is left at a higher one."""
 
-    stability_offset: float = 1.0
-    """How far the threshold is moved each way, logits."""
-
-    max_overlap: float = 0.7
+    max_overlap: Share = 0.7
     """Boxes that overlap more, as IoU in [0, 1], are of one mask; the surest is kept."""
 
-    min_area: float = 0.0
+    min_area: Share = 0.0
     """Least share of the image, in [0, 1], that a mask covers."""
 
-    crop_layers: int = 0
+    crop_layers: Annotated[int, Meta(ge=0, le=3)] = 0
     """Layers of crops that are looked at too, 4 crops in the first, 16 in the second: finds what is
     small, for a pass of the network each."""
-
-    prompts_per_batch: int = 64
-    """Points that the network answers together. Changes time and memory only."""
-
-    def __post_init__(self) -> None:
-        convert_fields(self)
-        for name in ("points_per_side", "prompts_per_batch"):
-            if getattr(self, name) < 1:
-                raise RangeError(f"{name}: expected 1 or more, got {getattr(self, name)}.")
-        if not 0 <= self.crop_layers <= 3:
-            raise RangeError(f"crop_layers: expected 0 to 3, got {self.crop_layers}.")
-        for name in ("min_iou", "min_stability", "max_overlap", "min_area"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise RangeError(f"{name}: expected 0 to 1, got {getattr(self, name)}.")
-        if self.stability_offset < 0:
-            raise RangeError(f"stability_offset: expected 0 or more, got {self.stability_offset}.")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -85,6 +82,13 @@ class Candidates:
     boxes: Float[Tensor, "k 4"]
     """x0, y0, x1, y1 in [0, 1] of the image."""
 
+    def without_duplicates(self, max_overlap: float) -> "Candidates":
+        """Those that no surer one overlaps more, by their boxes."""
+        index = distinct(self.boxes, self.scores, max_overlap)
+        return Candidates(
+            logits=self.logits[index], scores=self.scores[index], boxes=self.boxes[index]
+        )
+
 
 def grid_points(per_side: int, height: int, width: int) -> Float[Tensor, "n 2"]:
     """Points in the middle of the cells of a grid over an image, row by row; x, y in pixels."""
@@ -93,17 +97,15 @@ def grid_points(per_side: int, height: int, width: int) -> Float[Tensor, "n 2"]:
     return torch.stack((x.reshape(-1), y.reshape(-1)), dim=1)
 
 
-def candidates(
-    decode: Decode, points: Float[Tensor, "n 2"], options: MaskGeneratorOptions
-) -> Candidates:
+def candidates(decode: Decode, points: Float[Tensor, "n 2"], options: SamOptions) -> Candidates:
     """The masks for points that are sure and stable; duplicates are not removed yet."""
     kept: list[Candidates] = []
-    for first in range(0, len(points), options.prompts_per_batch):
-        logits, scores = decode(points[first : first + options.prompts_per_batch])
+    for first in range(0, len(points), PROMPTS_PER_BATCH):
+        logits, scores = decode(points[first : first + PROMPTS_PER_BATCH])
         logits, scores = logits.flatten(0, 1), scores.flatten()
         sure = scores >= options.min_iou
         logits, scores = logits[sure], scores[sure]
-        steady = stability(logits, options.stability_offset) >= options.min_stability
+        steady = stability(logits, STABILITY_OFFSET) >= options.min_stability
         logits, scores = logits[steady].float(), scores[steady].float()
         shown = (logits > 0).flatten(1).any(dim=1)
         kept.append(
@@ -112,7 +114,7 @@ def candidates(
             )
         )
         # One batch may keep thousands of copies of a thing; they need not wait for the end.
-        kept[-1] = _chosen(kept[-1], distinct(kept[-1], options.max_overlap))
+        kept[-1] = kept[-1].without_duplicates(options.max_overlap)
     return Candidates(
         logits=torch.cat([one.logits for one in kept]),
         scores=torch.cat([one.scores for one in kept]),
@@ -141,10 +143,12 @@ def mask_boxes(masks: Bool[Tensor, "k h w"]) -> Float[Tensor, "k 4"]:
     return torch.stack((x0, y0, x1, y1), dim=1).float()
 
 
-def distinct(found: Candidates, max_overlap: float) -> Int[Tensor, "kept"]:
+def distinct(
+    boxes: Float[Tensor, "k 4"], scores: Float[Tensor, "k"], max_overlap: float
+) -> Int[Tensor, "kept"]:
     """Non-maximum suppression: of boxes that overlap the surest stays, the first among equals."""
-    order = torch.sort(found.scores, descending=True, stable=True).indices
-    overlaps = _box_iou(found.boxes[order]) > max_overlap
+    order = torch.sort(scores, descending=True, stable=True).indices
+    overlaps = _box_iou(boxes[order]) > max_overlap
     gone = torch.zeros(len(order), dtype=torch.bool)
     rows = overlaps.cpu()
     kept: list[int] = []
@@ -163,14 +167,8 @@ def _box_iou(boxes: Float[Tensor, "k 4"]) -> Float[Tensor, "k k"]:
     return both / (area[:, None] + area[None] - both).clamp_min(1e-12)
 
 
-def _chosen(found: Candidates, index: Tensor) -> Candidates:
-    return Candidates(
-        logits=found.logits[index], scores=found.scores[index], boxes=found.boxes[index]
-    )
-
-
 def automatic_masks(
-    image: Image, decoder_of: Callable[[Image], Decode], options: MaskGeneratorOptions
+    image: Image, decoder_of: Callable[[Image], Decode], options: SamOptions
 ) -> MaskSet:
     """Masks of an image and, where crops are asked for, of parts of it, with their levels.
 
@@ -186,15 +184,14 @@ def automatic_masks(
         rows, columns = (int(side) for side in part.shape[:2])
         points = grid_points(options.points_per_side, rows, columns)
         seen = candidates(decoder_of(part), points, options)
-        seen = _chosen(seen, distinct(seen, options.max_overlap))
+        seen = seen.without_duplicates(options.max_overlap)
         found += _placed(seen, crop, layer, (height, width), options.min_area)
     # What a finer layer of crops saw comes before what a coarser one did.
     found.sort(key=lambda one: (-one.layer, -one.score))
     if options.crop_layers and found:
         boxes = torch.tensor([one.box for one in found])
         rank = torch.arange(len(found), 0, -1, dtype=torch.float32)
-        whole = Candidates(logits=boxes[:, None, :], scores=rank, boxes=boxes)
-        found = [found[i] for i in distinct(whole, options.max_overlap).tolist()]
+        found = [found[i] for i in distinct(boxes, rank, options.max_overlap).tolist()]
     found.sort(key=lambda one: -one.score)
     small = [_reduced(one.mask.decode()) for one in found]
     return MaskSet(
@@ -277,10 +274,6 @@ def _reduced(mask: Bool[Tensor, "height width"]) -> Bool[Tensor, "rows columns"]
     """A mask at a size at which many can be compared."""
     step = max(1, max(mask.shape) // _COMPARED)
     return mask[step // 2 :: step, step // 2 :: step]
-
-
-CONTAINED = 0.9
-"""Share of a mask that lies in a larger one which contains it."""
 
 
 def nesting_levels(masks: Bool[Tensor, "k pixels"]) -> Int[Tensor, "k"]:

@@ -1,16 +1,23 @@
-"""Where the weights of a model are: a folder, or what the hub's cache of this machine holds.
+"""Families of 2D models, and their weights: a folder, a file, or what the hub's cache holds.
 
-Nothing is fetched unless it is asked for; then size and licence are said first.
+Nothing is imported or read to know a family; `ModelFamily.load` does that. Nothing is fetched
+unless it is asked for; then size and licence are said first.
 """
 
 import hashlib
 import importlib
 import re
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+import torch
+
+from splatseg.core.models import Model
+from splatseg.core.options import Count, options
 from splatseg.errors import (
+    BackendError,
     FileFormatError,
     InputError,
     MissingFileError,
@@ -20,8 +27,12 @@ from splatseg.errors import (
 )
 from splatseg.io.foreign import is_file
 from splatseg.io.json_files import read_json
-from splatseg.models._family import Checkpoint, LoadOptions, ModelFamily
 
+What = Literal["masks", "labels", "panoptic", "features", "text", "depth", "tracked"]
+"""What a model can be asked for."""
+
+_GPU_BATCH = 16
+_TYPES = {"float32": torch.float32, "float16": torch.float16, "bfloat16": torch.bfloat16}
 _HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")
 _WEIGHTS = ("*.safetensors", "*.bin", "*.pt", "*.ckpt")
 _WHOLE = ("model.safetensors", "pytorch_model.bin")
@@ -32,28 +43,197 @@ _FILES = ("*.json", "*.txt", "*.model")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 
 
-def find_weights(
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Checkpoint:
+    """Published weights, on the Hugging Face hub or elsewhere."""
+
+    id: str
+    """OWNER/NAME on the hub; the name of the file elsewhere."""
+
+    megabytes: int
+    """Size of the download, MB; of weights elsewhere, of the part that is used."""
+
+    licence: str
+    """As the model card names it."""
+
+    note: str = ""
+    """What else one should know, such as that access must be asked for, or where the file is."""
+
+    on_hub: bool = True
+    """Whether the hub has them; nothing is fetched from elsewhere."""
+
+
+@options
+class LoadOptions:
+    """Which weights a model gets, and where and how it runs."""
+
+    weights: str | None = None
+    """Folder of the weights, or their id on the Hugging Face hub, of which only what is on this
+    machine is taken; a file where a model's weights are one. None takes the default of the
+    model."""
+
+    download: bool = False
+    """Fetch weights from the hub that are not on this machine, after a note of their size and
+    licence."""
+
+    device: str = "auto"
+    """Device of the network: cpu, cuda or cuda:N. auto takes cuda where there is one."""
+
+    dtype: Literal["float32", "float16", "bfloat16"] = "float32"
+    """Precision of the network."""
+
+    batch: Count | None = None
+    """Images that pass the network together. None takes one on a CPU and as many as memory holds
+    on a GPU. Changes the time, and results by rounding at most."""
+
+    size: Count | None = None
+    """Side of the network's input, pixels: the longer one, or both where the network takes
+    squares. None takes what the weights were made for."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Loading:
+    """Weights that are on this machine, and where the network is to run."""
+
+    folder: Path
+    """Folder of the weights."""
+
+    name: str
+    """An id of the hub, or the name of the folder."""
+
+    digest: str
+    """SHA-256 of configuration and weights."""
+
+    device: torch.device
+    dtype: torch.dtype
+    batch: int | None
+    size: int | None
+    report: Callable[[str], None]
+    """Called with sentences for the user."""
+
+    download: bool = False
+    """Whether further weights that the model needs may be fetched."""
+    file: Path | None = None
+    """The file of the weights, where the family takes a single one."""
+
+    @property
+    def images_together(self) -> int:
+        """Images that pass the network together, fewer where memory does not hold them."""
+        if self.batch is not None:
+            return self.batch
+        return 1 if self.device.type == "cpu" else _GPU_BATCH
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModelFamily:
+    """Models that are loaded in the same way and answer the same questions."""
+
+    name: str
+    """Name in `see --model NAME`."""
+
+    summary: str
+    """One line, lower case, without a full stop."""
+
+    reference: str
+    """The paper, or what else says how it works."""
+
+    gives: tuple[What, ...]
+    """What `see` can ask a model of it for, the most telling first."""
+
+    options: type[Any]
+    """Frozen dataclass with defaults: what is set of such a model besides its weights."""
+
+    load: Callable[[Any, Loading | None], Model]
+    """Makes a model of options and weights; of None where the family has no weights."""
+
+    checkpoints: tuple[Checkpoint, ...] = ()
+    """Published weights that it takes, the default first; none where it needs none."""
+
+    single_file: bool = False
+    """Weights are one file in a layout of its own, without config.json; `Loading.file` is it."""
+
+    instead: str = ""
+    """What serves where its weights are not to be had; a clause, lower case."""
+
+    @property
+    def needs_weights(self) -> bool:
+        """Whether a model of it has weights."""
+        return bool(self.checkpoints)
+
+
+def loading_of(
     family: ModelFamily,
     options: LoadOptions,
     *,
     report: Callable[[str], None],
     flag: str = "--weights",
-) -> tuple[Path, str]:
-    """The folder of the weights that are asked for, and what they are called.
-
-    Of a family whose weights are a single file it is that file.
+) -> Loading:
+    """The weights of a model, found or fetched, and where it is to run.
 
     Args:
         family: The model's family.
-        options: Which weights, and whether they may be fetched.
-        report: Told what is fetched.
+        options: Which weights, and where and how they run.
+        report: Called with sentences for the user.
         flag: Where the weights are named, for the sentence that they are not there.
 
     Raises:
-        MissingFileError: If they are not on this machine and may not be fetched, or cannot be.
-        MissingPackageError: If they are named by an id of the hub without the package for it.
-        InputError: If what is named is neither a folder nor an id.
+        BackendError: If there is no such device.
+        InputError: If it is no device at all.
+        MissingFileError: If the weights are not on this machine and are not to be fetched.
     """
+    device = _device(options.device)
+    found, name = _find_weights(family, options, report=report, flag=flag)
+    return Loading(
+        folder=found.parent if family.single_file else found,
+        file=found if family.single_file else None,
+        name=name,
+        digest=digest_of(found),
+        device=device,
+        dtype=_TYPES[options.dtype],
+        batch=options.batch,
+        size=options.size,
+        report=report,
+        download=options.download,
+    )
+
+
+def second_loading(
+    family: ModelFamily, weights: str | None, place: Loading, *, flag: str
+) -> Loading:
+    """The weights of a second network of a model, found by the same rules as those of the first.
+
+    Args:
+        family: The second network's family.
+        weights: Folder or id of its weights; None takes the default of its family.
+        place: The first network's; the second runs there and in the same precision.
+        flag: Where the weights are named.
+    """
+    options = LoadOptions(
+        weights=weights, download=place.download, device=str(place.device), batch=place.batch
+    )
+    found = loading_of(family, options, report=place.report, flag=flag)
+    return replace(found, dtype=place.dtype)
+
+
+def _device(name: str) -> torch.device:
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+    except RuntimeError as error:
+        raise InputError(f"device: expected cpu, cuda or cuda:N, got {name!r:.40}.") from error
+    if device.type not in ("cpu", "cuda"):
+        raise InputError(f"device: expected cpu, cuda or cuda:N, got {name!r:.40}.")
+    count = torch.cuda.device_count()
+    if device.type == "cuda" and (device.index or 0) >= count:
+        raise BackendError(f"device: expected one of {count} GPUs that PyTorch sees, got {name}.")
+    return device
+
+
+def _find_weights(
+    family: ModelFamily, options: LoadOptions, *, report: Callable[[str], None], flag: str
+) -> tuple[Path, str]:
+    """The folder of the weights, or their file, and what they are called."""
     if family.single_file:
         return _single_file(family, options)
     asked = options.weights or family.checkpoints[0].id
@@ -116,11 +296,7 @@ def weight_files(folder: Path) -> list[Path]:
 
 
 def cached_file(id: str, name: str) -> Path | None:
-    """A file of a repository of the hub, if the hub's cache of this machine has it.
-
-    Raises:
-        MissingPackageError: If the package for the hub is not installed.
-    """
+    """A file of a repository of the hub, if the hub's cache of this machine has it."""
     if not _HUB_ID.fullmatch(id):
         return None
     found = _hub().try_to_load_from_cache(id, name)
@@ -181,12 +357,7 @@ def _check_entries(folder: Path) -> None:
 
 
 def _check_parts(folder: Path) -> None:
-    """Refuse weights in several parts of which some are not there, or lie elsewhere.
-
-    Raises:
-        FileFormatError: If an index names files that are not beside it.
-        MissingFileError: If a file that the index of the weights names is not there.
-    """
+    """Refuse weights in several parts of which some are not there, or lie elsewhere."""
     for index in sorted(folder.glob("*.index.json")):
         for name in _parts(index):
             if name != Path(name).name:
@@ -255,12 +426,8 @@ def _fetched(id: str, report: Callable[[str], None], flag: str) -> Path:
 def _wanted(sizes: Mapping[str, int]) -> tuple[Sequence[str], int]:
     """The files of a repository that are needed, and their bytes: one format of the weights."""
     top = [name for name in sizes if "/" not in name]
-    for pattern in _WEIGHTS:
-        weights = [name for name in top if Path(name).match(pattern)]
-        if weights:
-            break
-    else:
-        weights = []
+    by_format = ([name for name in top if Path(name).match(one)] for one in _WEIGHTS)
+    weights = next((names for names in by_format if names), [])
     names = [name for name in top if any(Path(name).match(p) for p in _FILES)] + weights
     return names, sum(sizes[name] for name in names)
 

@@ -11,26 +11,27 @@ With the projector of features that were trained under guidance, a mask is asked
 features (SAM-based prompts): the mean of its projected features is the query if the pixels that it
 finds in the view cover 90 % of the mask, centres of k-means over them otherwise.
 
-What is similar, and the threshold, by `FeatureSourceOptions.rule`: *fixed* compares by cosine with
-one number, SAM-based prompts too. *adaptive* is the paper's: cosines with the mean of all scores as
-the threshold; of SAM-based prompts products (eq. 12), with the mean and one standard deviation.
-*code* compares as adaptive does, with the published code's threshold
+What is similar, and the threshold, by `FeatureMembershipOptions.rule`: *fixed* compares by cosine
+with one number, SAM-based prompts too. *adaptive* is the paper's: cosines with the mean of all
+scores as the threshold; of SAM-based prompts products (eq. 12), with the mean and one standard
+deviation. *code* compares as adaptive does, with the published code's threshold
 (`retrieval.published_threshold`).
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from msgspec import Meta
 from torch import Tensor
 
-from splatseg._check import check_choice, check_range
 from splatseg.core import FeatureMap, Features, Gaussians, View
-from splatseg.core.boundary import boundary, convert_fields
-from splatseg.errors import InputError, RangeError, ShapeError
+from splatseg.core.boundary import boundary
+from splatseg.core.options import options
+from splatseg.errors import InputError, ShapeError
 from splatseg.lift.affinity import AffinityHead
 from splatseg.prompting.retrieval import (
     Similarity,
@@ -44,41 +45,34 @@ from splatseg.prompting.seen import SeenPrompt
 from splatseg.render import SparseWeights
 
 ThresholdRule = Literal["fixed", "adaptive", "code"]
+_CLUSTERS = 5
+"""Queries that strokes and masks are reduced to by k-means, as published."""
+
 _COVERED = 0.9
 _OBJECT = 0.5
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FeatureSourceOptions:
+@options(
+    removed={
+        "precision": "features are held in float16",
+        "clusters": f"strokes and masks are reduced to {_CLUSTERS} queries, as published",
+    }
+)
+class FeatureMembershipOptions:
     """How features answer prompts."""
-
-    precision: Literal["float32", "float16", "int8"] = "float16"
-    """What features are held in: int8 takes half of the memory and flips a few of a hundred
-    Gaussians near the threshold."""
-
-    clusters: int = 5
-    """Queries that strokes and masks are reduced to by k-means."""
 
     rule: ThresholdRule = "fixed"
     """What a score must exceed. fixed: `threshold`. adaptive: the mean of the scores, of SAM-based
     prompts mean and one standard deviation, as in the paper. code: as in its published code."""
 
-    threshold: float = 0.85
+    threshold: Annotated[float, Meta(ge=-1, le=1)] = 0.85
     """Similarity in [-1, 1] of the fixed rule. The published code has 0.75; decision 0030."""
 
     seed: int = 0
-    """Of k-means."""
-
-    def __post_init__(self) -> None:
-        convert_fields(self)
-        check_choice("precision", self.precision, ("float32", "float16", "int8"))
-        check_choice("rule", self.rule, get_args(ThresholdRule))
-        check_range("threshold", self.threshold, -1.0, 1.0)
-        if self.clusters < 1:
-            raise RangeError(f"clusters: expected at least 1, got {self.clusters}.")
+    """Seed of k-means."""
 
 
-class FeatureSource:
+class FeatureMembership:
     """Answers prompts by the features of Gaussians.
 
     Args:
@@ -98,7 +92,7 @@ class FeatureSource:
         features: Features,
         gaussians: Gaussians,
         *,
-        options: FeatureSourceOptions | None = None,
+        options: FeatureMembershipOptions | None = None,
         guidance: Callable[[View], FeatureMap | None] | None = None,
     ) -> None:
         if len(features) != len(gaussians):
@@ -106,7 +100,7 @@ class FeatureSource:
                 f"features: expected {len(gaussians)} rows, one a Gaussian of the scene, got "
                 f"{len(features)}; they are of another scene."
             )
-        self._options = options or FeatureSourceOptions()
+        self._options = options or FeatureMembershipOptions()
         self._values = features.values.detach().cpu().float()
         self._seen = None if features.weights is None else features.weights.cpu() > 0
         self._head = AffinityHead.of(features) if features.info.head is not None else None
@@ -122,28 +116,28 @@ class FeatureSource:
     def membership(
         self, prompts: Sequence[SeenPrompt], *, granularity: float | None = None
     ) -> Float[Tensor, "n"]:
-        """How likely each Gaussian belongs to what is shown, see `sources.MembershipSource`.
+        """How likely each Gaussian belongs to what is shown, see `MembershipSource`.
 
         Raises:
             InputError: If the prompts show nothing that has a feature.
         """
-        asked = self._asked(prompts)
-        if not asked:
+        queries = self._queries(prompts)
+        if not queries:
             raise InputError("features: expected features where the prompts are, got none.")
         gate = self._gate(granularity)
-        confidence = torch.stack([self._confidence(one, gate) for one in asked]).amax(dim=0)
+        confidence = torch.stack([self._confidence(one, gate) for one in queries]).amax(dim=0)
         negative = torch.cat([self._values[:0], *map(self._negative, prompts)])
         if len(negative):
             # Equally like what is meant and what is not is the border as well.
-            positive = torch.cat([one.queries for one in asked])
+            positive = torch.cat([one.queries for one in queries])
             found = scores(self._stored("cosine"), positive, gate=gate)
             against = scores(self._stored("cosine"), negative, gate=gate)
             confidence = torch.minimum(confidence, (0.5 + (found - against)).clamp(0, 1))
         return confidence if self._seen is None else confidence.where(self._seen, 0.0)
 
-    def _asked(self, prompts: Sequence[SeenPrompt]) -> list["_Asked"]:
+    def _queries(self, prompts: Sequence[SeenPrompt]) -> list["_Queries"]:
         """Positive queries of all prompts, those of one similarity together."""
-        found: dict[Similarity, list[_Asked]] = {"cosine": [], "dot": []}
+        found: dict[Similarity, list[_Queries]] = {"cosine": [], "dot": []}
         for prompt in prompts:
             shown = self._shown(prompt.positive_rows)
             queries = None
@@ -155,38 +149,36 @@ class FeatureSource:
             similarity: Similarity = "dot" if by_product else "cosine"
             if len(queries):
                 inside = shown if prompt.dense else shown[:0]
-                found[similarity].append(_Asked(similarity, queries, inside))
-        return [_Asked.together(some) for some in found.values() if some]
+                found[similarity].append(_Queries(similarity, queries, inside))
+        return [_Queries.together(some) for some in found.values() if some]
 
-    def _confidence(self, asked: "_Asked", gate: Tensor | None) -> Float[Tensor, "n"]:
+    def _confidence(self, query: "_Queries", gate: Tensor | None) -> Float[Tensor, "n"]:
         """In [0, 1], 0.5 at the threshold of the rule."""
-        found = scores(self._stored(asked.similarity), asked.queries, gate=gate)
-        if asked.similarity == "cosine":
-            return _around(found, self._limit(found, asked, gate), low=-1.0, high=1.0)
+        found = scores(self._stored(query.similarity), query.queries, gate=gate)
+        if query.similarity == "cosine":
+            return _around(found, self._limit(found, query, gate), low=-1.0, high=1.0)
         ends = float(found.min()), float(found.max())
-        return _around(found, self._limit(found, asked, gate), low=ends[0], high=ends[1])
+        return _around(found, self._limit(found, query, gate), low=ends[0], high=ends[1])
 
-    def _limit(self, found: Tensor, asked: "_Asked", gate: Tensor | None) -> float:
+    def _limit(self, found: Tensor, query: "_Queries", gate: Tensor | None) -> float:
         match self._options.rule:
             case "fixed":
                 return self._options.threshold
             case "adaptive":
-                by_product = asked.similarity == "dot"
+                by_product = query.similarity == "dot"
                 return deviation_threshold(found) if by_product else mean_threshold(found)
             case "code":
-                if not len(asked.inside):
+                if not len(query.inside):
                     return published_threshold(found, found[:0])
                 inside = StoredFeatures.of(
-                    asked.inside, precision="float32", similarity=asked.similarity
+                    query.inside, precision="float32", similarity=query.similarity
                 )
-                return published_threshold(found, scores(inside, asked.queries, gate=gate))
+                return published_threshold(found, scores(inside, query.queries, gate=gate))
 
     def _stored(self, similarity: Similarity) -> StoredFeatures:
         """The features as they are compared, made when they are first asked for."""
         if similarity not in self._made:
-            self._made[similarity] = StoredFeatures.of(
-                self._values, precision=self._options.precision, similarity=similarity
-            )
+            self._made[similarity] = StoredFeatures.of(self._values, similarity=similarity)
         return self._made[similarity]
 
     def _gate(self, granularity: float | None) -> Tensor | None:
@@ -201,7 +193,7 @@ class FeatureSource:
 
     def _thinned(self, prompt: SeenPrompt, shown: Float[Tensor, "p d"]) -> Float[Tensor, "q d"]:
         """What pixels show, of strokes, masks and boxes the centres of k-means."""
-        many = prompt.dense and len(shown) > self._options.clusters
+        many = prompt.dense and len(shown) > _CLUSTERS
         return self._centres(shown) if many else shown
 
     def _shown(self, rows: SparseWeights) -> Float[Tensor, "p d"]:
@@ -222,7 +214,7 @@ class FeatureSource:
         query = projected.mean(dim=0, keepdim=True)
         shown = prompt.rows.to("cpu").product(self._values)
         covered = float(((shown @ query.T) > 0).float().mean())
-        if covered >= _COVERED or len(projected) <= self._options.clusters:
+        if covered >= _COVERED or len(projected) <= _CLUSTERS:
             return query
         return self._centres(projected)
 
@@ -230,14 +222,14 @@ class FeatureSource:
         """Centres of k-means."""
         from sklearn.cluster import KMeans
 
-        count = min(self._options.clusters, len(np.unique(values.numpy(), axis=0)))
+        count = min(_CLUSTERS, len(np.unique(values.numpy(), axis=0)))
         made = KMeans(n_clusters=count, random_state=self._options.seed)
         made.fit(values.double().numpy())
         return torch.from_numpy(made.cluster_centers_).float()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Asked:
+class _Queries:
     """Queries that scores are made with in one way."""
 
     similarity: Similarity
@@ -246,7 +238,7 @@ class _Asked:
     """What pixels of masks and strokes show; a point alone would be as alike as can be."""
 
     @classmethod
-    def together(cls, some: Sequence["_Asked"]) -> "_Asked":
+    def together(cls, some: Sequence["_Queries"]) -> "_Queries":
         """Those of several prompts."""
         return cls(
             some[0].similarity,

@@ -1,11 +1,37 @@
-r"""The neighbour graph of a scene, built once and kept for many selections.
+r"""What neighbours say of a selection: specks, holes, hidden Gaussians, and its border.
 
-Refining, filling holes and completing a selection all ask which Gaussians are neighbours, how
-alike they are, and whether they touch. For a scene of 400 k Gaussians that takes seconds to find
-and milliseconds to look up, so a session builds a `NeighbourGraph` when the scene opens.
+The neighbour graph of a scene says which Gaussians are neighbours, how alike they are
+(`lift.completion.graph`: distance, colour, normal), and whether they touch. For 400 k Gaussians
+that takes seconds to find and milliseconds to look up, so a session keeps one.
 
-Strengths are those of `lift.completion.graph`: distance, colour, normal and, where there are
-any, features. Two Gaussians touch as in `selection.components`.
+A *hole* is a connected piece of Gaussians that are not selected and around which nearly all are;
+a *speck* is a small connected piece of selected ones apart from the rest. Pieces hang together
+where ellipsoids touch (`selection.components`). A hole is looked for from the selection outwards
+and only as far as holes may be large, so that the time depends on the selection and not on the
+scene.
+
+A *hidden* Gaussian is one that no view explains: it lies inside or behind things. Its membership
+is the share of random walks over the neighbour graph that first meet evidence inside, among those
+that meet any, as in `lift.completion.complete`,
+
+.. math:: (a_i, b_i) \leftarrow \sum_j P_{ij} (a_j, b_j), \qquad P = D^{-1} W, \qquad
+          p_i = \frac{a_i}{a_i + b_i}
+
+with (p, 1 - p) held where p is known.
+
+The *border* of a selection goes where neighbours are least alike: every Gaussian i is in (x = 1) or
+out (x = 0), and of all labellings the one of least energy is taken,
+
+.. math:: E(x) = \sum_i \bigl(-x_i \log p_i - (1 - x_i) \log (1 - p_i)\bigr)
+          + \frac{\lambda}{\bar d} \sum_{(i, j)} w_{ij} [x_i \ne x_j]
+
+with the strengths w of the graph and :math:`\bar d` their mean sum over the neighbours of a
+Gaussian. Gaussians that a person clicked are held. The least energy is that of a minimum cut, found
+exactly by maximum flow. Only a *band* around the border takes part: Gaussians a few steps over the
+graph from an edge whose ends differ, and the unsure ones that hang together with them.
+
+Boykov and Jolly, Interactive Graph Cuts for Optimal Boundary & Region Segmentation (2001);
+Kolmogorov and Zabih, What Energy Functions Can Be Minimized via Graph Cuts? (2004), theorem 4.1.
 """
 
 from dataclasses import dataclass
@@ -14,39 +40,67 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int64
+from numpy.typing import NDArray
 from torch import Tensor
 
-from splatseg.core import Features, Gaussians
-from splatseg.core.boundary import boundary, convert_fields
-from splatseg.errors import RangeError, ShapeError
-from splatseg.lift.completion.graph import NodeAttributes, flat_normals, neighbour_graph
-from splatseg.selection import touching
+from splatseg._check import check_shape, check_values
+from splatseg.core import Gaussians, Selection
+from splatseg.core.boundary import boundary
+from splatseg.core.options import Count
+from splatseg.lift.completion.graph import (
+    NodeAttributes,
+    flat_normals,
+    neighbour_graph,
+    transition_matrix,
+)
+from splatseg.selection import pieces, touching
 
+_NEIGHBOURS = 12
+"""Nearest Gaussians of each one; an edge is there where either end is among the other's."""
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class GraphOptions:
-    """Which Gaussians are neighbours, and what makes them alike."""
+_COLOUR_WIDTH = 0.1
+"""Standard deviation of colours in [0, 1] that count as alike."""
 
-    neighbours: int = 12
-    """Nearest Gaussians of each one; an edge is there where either end is among the other's."""
+_NORMAL_WIDTH = 0.5
+"""Standard deviation of the sine between normals of flat Gaussians that count as alike."""
 
-    colour_width: float = 0.1
-    """Standard deviation of colours in [0, 1] that count as alike."""
+_MAX_HOLE = 20
+"""Most Gaussians of a hole that is filled."""
 
-    feature_width: float = 1.0
-    """Width of the feature affinity, in squared median distances of features along edges."""
+_MIN_ENCLOSED = 0.9
+"""Minimum share of the neighbours around a hole that are selected."""
 
-    normal_width: float = 0.5
-    """Standard deviation of the sine between normals of flat Gaussians that count as alike."""
+_MAX_SPECK = 10
+"""Most Gaussians of a speck that is removed."""
 
-    def __post_init__(self) -> None:
-        convert_fields(self)
-        if self.neighbours < 1:
-            raise RangeError(f"neighbours: expected at least 1, got {self.neighbours}.")
-        for name in ("colour_width", "feature_width", "normal_width"):
-            value = getattr(self, name)
-            if not value > 0:
-                raise RangeError(f"{name}: expected a positive number, got {value}.")
+_SPREAD_STEPS = 20
+"""Steps over the graph that memberships spread to hidden Gaussians."""
+
+_MIN_MEMBER = 0.25
+"""Membership of a Gaussian from which it spreads to hidden ones; those that none so likely leads to
+are out. The lower, the more of the scene is looked at."""
+
+_SMOOTHNESS = 4.0
+"""Lambda: what it costs a Gaussian to be on another side than all of its neighbours, which are as
+alike as they are on average in the scene, in nats of its membership: outweighs one of 0.98."""
+
+_MIN_PROBABILITY = 0.02
+"""Membership is taken to be at least this and at most 1 less this: how sure a source can be."""
+
+_BAND = 2
+"""Steps over the graph from the border that Gaussians are decided anew."""
+
+_UNSURE = 0.25
+"""Gaussians whose membership and its complement are both at least this are decided anew where they
+hang together with the band."""
+
+_MAX_BAND = 20_000
+"""Most Gaussians that are decided anew, those nearest to the border over the graph first."""
+
+_MAX_CAPACITY = 2**30 - 1
+"""Largest capacity: a residual capacity is up to twice one, and SciPy's are int32."""
+
+_MAX_FLOW = 2**31 - 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -85,13 +139,6 @@ class NeighbourGraph:
     def __len__(self) -> int:
         return int(self.strengths.shape[0])
 
-    @property
-    def nbytes(self) -> int:
-        """Memory that it takes, bytes."""
-        matrix = self.strengths
-        parts = (matrix.data, matrix.indices, matrix.indptr)
-        return sum(int(part.nbytes) for part in parts) + self.touching.nbytes
-
     def edges(self, rows: Int64[Tensor, "m"]) -> Edges:
         """All edges that leave some rows; a row may be asked for twice."""
         matrix = self.strengths
@@ -107,72 +154,348 @@ class NeighbourGraph:
             touching=self.touching[torch.from_numpy(entries)],
         )
 
-    def check(self, name: str, values: Tensor) -> None:
-        """Raise `ShapeError` unless `values` has one row a Gaussian."""
-        if len(values) != len(self):
-            raise ShapeError(
-                f"{name}: expected {len(self)} rows, those of the graph's Gaussians, "
-                f"got {len(values)}."
-            )
-
 
 @boundary
-def build_graph(
-    gaussians: Gaussians,
-    *,
-    features: Features | None = None,
-    options: GraphOptions | None = None,
-) -> NeighbourGraph:
+def build_graph(gaussians: Gaussians, *, neighbours: Count = _NEIGHBOURS) -> NeighbourGraph:
     """Find the neighbours of every Gaussian; seconds for a scene, so keep what it returns.
 
     Args:
         gaussians: The Gaussians of the scene.
-        features: What else makes neighbours alike, compared by direction; rows of zeros are
-            Gaussians of which nothing is known.
-        options: Which are neighbours, and what makes them alike.
+        neighbours: Nearest Gaussians of each one that are its neighbours.
 
     Raises:
-        ShapeError: If there is not one row of features a Gaussian.
         RangeError: If a value is NaN or infinite.
-
-    Example:
-        >>> row = torch.arange(4.0).unsqueeze(1) * torch.tensor([[1.0, 0.0, 0.0]])
-        >>> g = Gaussians(means=row, rotations=torch.eye(4)[:1].expand(4, 4),
-        ...               scales=torch.full((4, 3), 0.3), opacities=torch.ones(4),
-        ...               sh=torch.zeros(4, 1, 3))
-        >>> graph = build_graph(g, options=GraphOptions(neighbours=1))
-        >>> graph.edges(torch.tensor([1])).second
-        tensor([0, 2])
     """
-    options = options or GraphOptions()
     gaussians.check_values()
-    if features is not None and len(features) != len(gaussians):
-        raise ShapeError(
-            f"features: expected {len(gaussians)} rows, one a Gaussian, got {len(features)}."
-        )
     gaussians = gaussians.to(device="cpu")
     matrix = neighbour_graph(
         NodeAttributes(
             positions=gaussians.means.detach().double().numpy(),
             colours=gaussians.colours.detach().float().clamp(0, 1).numpy(),
-            features=None if features is None else features.values.detach().cpu().float().numpy(),
             normals=flat_normals(gaussians),
         ),
-        neighbours=options.neighbours,
-        colour_width=options.colour_width,
-        feature_width=options.feature_width,
-        normal_width=options.normal_width,
+        neighbours=neighbours,
+        colour_width=_COLOUR_WIDTH,
+        feature_width=1.0,
+        normal_width=_NORMAL_WIDTH,
     )
     first = torch.from_numpy(np.repeat(np.arange(len(gaussians)), np.diff(matrix.indptr)))
     second = torch.from_numpy(matrix.indices.astype(np.int64))
     degree = float(matrix.data.sum(dtype=np.float64)) / max(len(gaussians), 1)
+    # Each edge is asked for in both directions alike, so that rounding agrees.
+    low, high = torch.minimum(first, second), torch.maximum(first, second)
     return NeighbourGraph(
         strengths=matrix,
-        touching=_touching(gaussians, first, second),
+        touching=touching(gaussians, low, high),
         mean_degree=degree if degree > 0 else 1.0,
     )
 
 
-def _touching(gaussians: Gaussians, first: Tensor, second: Tensor) -> Tensor:
-    """Which edges touch. Each is asked for in both directions alike, so that rounding agrees."""
-    return touching(gaussians, torch.minimum(first, second), torch.maximum(first, second))
+def holes(graph: NeighbourGraph, selection: Selection) -> Selection:
+    """Gaussians that are not selected and lie in holes of the selection.
+
+    ``selection | holes(graph, selection)`` has none.
+    """
+    check_shape("selection", selection.mask, (len(graph),))
+    mask = selection.mask.cpu()
+    filled = torch.zeros_like(mask)
+    if not selection.count or selection.count == len(selection):
+        return Selection(mask=filled)
+    rows, piece_of = _small_pieces(graph, mask, _MAX_HOLE)
+    if not len(rows):
+        return Selection(mask=filled)
+    count = int(piece_of.max()) + 1
+    number = torch.full((len(mask),), -1, dtype=torch.int64)
+    number[rows] = piece_of
+    edges = graph.edges(rows)
+    own = piece_of[edges.first]
+    around = number[edges.second] != own
+    total = torch.bincount(own[around], minlength=count)
+    selected = torch.bincount(own[around & mask[edges.second]], minlength=count)
+    hole = (selected > 0) & (selected >= _MIN_ENCLOSED * total)
+    filled[rows[hole[piece_of]]] = True
+    return Selection(mask=filled)
+
+
+def _small_pieces(
+    graph: NeighbourGraph, mask: Bool[Tensor, "n"], largest: int
+) -> tuple[Int64[Tensor, "m"], Int64[Tensor, "m"]]:
+    """Whole pieces of at most `largest` rows outside `mask`, among them all that border on it.
+
+    Grows from the rows that border on the mask, a step at a time, until every piece is whole or
+    too large. Returns rows, and the number of the piece of each.
+    """
+    edges = graph.edges(torch.nonzero(mask).squeeze(1))
+    rows = torch.unique(edges.second[~mask[edges.second]])
+    reached = torch.zeros(len(mask), dtype=torch.bool)
+    reached[rows] = True
+    position = torch.full((len(mask),), -1, dtype=torch.int64)
+    while True:
+        position[rows] = torch.arange(len(rows))
+        edges = graph.edges(rows)
+        linked = edges.touching & ~mask[edges.second]
+        first, second = edges.first[linked], edges.second[linked]
+        known = reached[second]
+        piece_of = pieces(len(rows), first[known], position[second[known]])
+        small = torch.bincount(piece_of) <= largest
+        # Rows that are reached next are those that small pieces have not ended at.
+        ahead = ~known & small[piece_of[first]]
+        further = torch.unique(second[ahead])
+        if not len(further):
+            whole = small[piece_of]
+            return rows[whole], torch.unique(piece_of[whole], return_inverse=True)[1]
+        rows = torch.cat((rows, further))
+        reached[further] = True
+
+
+def specks(
+    graph: NeighbourGraph, selection: Selection, *, clicked: Selection | None = None
+) -> Selection:
+    """Selected Gaussians in small pieces apart from what was clicked, or from the largest piece.
+
+    Args:
+        graph: The neighbours of the scene's Gaussians.
+        selection: What may have specks.
+        clicked: Gaussians that a person pointed at: a piece that holds one is no speck. None, or
+            none of them selected, keeps the largest piece.
+    """
+    check_shape("selection", selection.mask, (len(graph),))
+    if clicked is not None:
+        check_shape("clicked", clicked.mask, (len(graph),))
+    mask = selection.mask.cpu()
+    found = torch.zeros_like(mask)
+    rows = torch.nonzero(mask).squeeze(1)
+    if not len(rows):
+        return Selection(mask=found)
+    position = torch.full((len(graph),), -1, dtype=torch.int64)
+    position[rows] = torch.arange(len(rows))
+    edges = graph.edges(rows)
+    linked = edges.touching & (position[edges.second] >= 0)
+    piece_of = pieces(len(rows), edges.first[linked], position[edges.second[linked]])
+    sizes = torch.bincount(piece_of)
+    speck = sizes <= _MAX_SPECK
+    held = piece_of[clicked.mask.cpu()[rows]] if clicked is not None else piece_of[:0]
+    speck[held if len(held) else sizes.argmax()] = False
+    found[rows[speck[piece_of]]] = True
+    return Selection(mask=found)
+
+
+def complete_membership(
+    graph: NeighbourGraph, membership: Float[Tensor, "n"], hidden: Bool[Tensor, "n"]
+) -> Float[Tensor, "n"]:
+    """Memberships of Gaussians that no view explains, from those of their neighbours.
+
+    Args:
+        graph: The neighbours of the scene's Gaussians.
+        membership: Probability in [0, 1] that a Gaussian belongs; of hidden ones it is not read.
+        hidden: True where nothing is known of a Gaussian.
+
+    Returns:
+        The memberships, with those of hidden Gaussians the share that arrived; 0 where only hidden
+        and unlikely ones are around.
+    """
+    check_shape("membership", membership, (len(graph),))
+    check_shape("hidden", hidden, (len(graph),))
+    unknown = hidden.cpu()
+    values = torch.where(unknown, 0.0, membership.detach().cpu().double())
+    check_values("membership", values, 0.0, 1.0)
+    rows = _near_members(graph, values >= _MIN_MEMBER, unknown)
+    if not len(rows):
+        return values.float()
+    transition = transition_matrix(graph.strengths[rows.numpy()])
+    known = (~unknown).double()
+    shares = torch.stack((values, known - values), dim=1).numpy()
+    source = transition @ shares
+    among_hidden = transition[:, rows.numpy()]
+    arrived = source
+    for _ in range(_SPREAD_STEPS - 1):
+        arrived = source + among_hidden @ arrived
+    total = torch.from_numpy(arrived.sum(axis=1))
+    inferred = torch.from_numpy(arrived[:, 0]) / total.clamp_min(1e-300)
+    return values.index_copy(0, rows, inferred.clamp(0, 1)).float()
+
+
+def _near_members(graph: NeighbourGraph, member: Tensor, hidden: Tensor) -> Int64[Tensor, "m"]:
+    """Hidden rows that so many steps over hidden ones lead to from a member, ascending."""
+    reached = torch.zeros_like(hidden)
+    rows = torch.nonzero(hidden).squeeze(1)
+    edges = graph.edges(rows)
+    frontier = torch.unique(rows[edges.first[member[edges.second]]])
+    for _ in range(_SPREAD_STEPS):
+        if not len(frontier):
+            break
+        reached[frontier] = True
+        ahead = graph.edges(frontier).second
+        frontier = torch.unique(ahead[hidden[ahead] & ~reached[ahead]])
+    return torch.nonzero(reached).squeeze(1)
+
+
+def graph_cut(
+    graph: NeighbourGraph,
+    membership: Float[Tensor, "n"],
+    *,
+    inside: Int64[Tensor, "a"],
+    outside: Int64[Tensor, "b"],
+) -> Float[Tensor, "n"]:
+    """Move the border of a selection to where neighbours are least alike.
+
+    Args:
+        graph: The neighbours of the scene's Gaussians.
+        membership: p, the probability in [0, 1] that a Gaussian belongs; more than 0.5 is in.
+        inside: Rows that are in, whatever else is known.
+        outside: Rows that are out, none of them inside.
+
+    Returns:
+        Probability in [0, 1] that a Gaussian belongs, given its own membership and the sides that
+        its neighbours are on; more than 0.5 for exactly those that are in. Outside the band it is
+        the membership given.
+    """
+    check_shape("membership", membership, (len(graph),))
+    check_values("membership", membership, 0.0, 1.0)
+    p = membership.detach().cpu().double().clone()
+    held = torch.zeros(len(p), dtype=torch.bool)
+    for rows, value in ((inside.cpu(), 1.0), (outside.cpu(), 0.0)):
+        p[rows] = value
+        held[rows] = True
+    mask = p > 0.5
+    band = _band(graph, p, mask, ~held)
+    if not len(band):
+        return p.float()
+    unary = torch.logit(p[band].clamp(_MIN_PROBABILITY, 1 - _MIN_PROBABILITY))
+    terms = _band_terms(graph, band, mask, unary)
+    chosen = minimum_cut(terms.unary, terms.first, terms.second, terms.weights)
+    conditional = torch.from_numpy(_conditional(terms, chosen)).float()
+    just_in = float(np.nextafter(np.float32(0.5), np.float32(1)))
+    conditional = torch.where(
+        torch.from_numpy(chosen), conditional.clamp_min(just_in), conditional.clamp_max(0.5)
+    )
+    return p.float().index_copy(0, band, conditional)
+
+
+def _band(graph: NeighbourGraph, p: Tensor, mask: Tensor, free: Tensor) -> Int64[Tensor, "m"]:
+    """Rows that are decided anew: near the border, and unsure ones that hang together with them."""
+    rows = _at_border(graph, mask)
+    taken = torch.zeros(len(graph), dtype=torch.bool)
+    taken[rows] = True
+    unsure = torch.minimum(p, 1 - p) >= _UNSURE
+    found = [rows[free[rows]]]
+    count, step = len(found[0]), 1
+    while len(rows) and count < _MAX_BAND:
+        near = graph.edges(rows).second
+        near = near[~taken[near]]
+        if step >= _BAND:
+            near = near[unsure[near]]
+        rows = torch.unique(near)
+        taken[rows] = True
+        found.append(rows[free[rows]])
+        count += len(found[-1])
+        step += 1
+    return torch.cat(found)[:_MAX_BAND].sort().values
+
+
+def _at_border(graph: NeighbourGraph, mask: Tensor) -> Int64[Tensor, "m"]:
+    """Rows with a neighbour on the other side, ascending."""
+    # The members are few and the scene is large: what they border on is found from their side.
+    lesser = mask if 2 * int(mask.sum()) <= len(mask) else ~mask
+    rows = torch.nonzero(lesser).squeeze(1)
+    edges = graph.edges(rows)
+    across = ~lesser[edges.second]
+    return torch.unique(torch.cat((rows[edges.first[across]], edges.second[across])))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _BandTerms:
+    """The energy of the band alone; positive unary terms prefer in."""
+
+    unary: NDArray[np.float64]
+    first: NDArray[np.int64]
+    second: NDArray[np.int64]
+    weights: NDArray[np.float64]
+
+
+def _band_terms(graph: NeighbourGraph, band: Tensor, mask: Tensor, unary: Tensor) -> _BandTerms:
+    """Neighbours outside the band stay on their side: edges to them are unary terms."""
+    edges = graph.edges(band)
+    weights = edges.strengths.double() * (_SMOOTHNESS / graph.mean_degree)
+    position = torch.full((len(graph),), -1, dtype=torch.int64)
+    position[band] = torch.arange(len(band))
+    other = position[edges.second]
+    fixed = other < 0
+    sides = torch.where(mask[edges.second[fixed]], 1.0, -1.0)
+    unary = unary.index_add(0, edges.first[fixed], weights[fixed] * sides)
+    once = edges.first < other
+    return _BandTerms(
+        unary=unary.numpy(),
+        first=edges.first[once].numpy(),
+        second=other[once].numpy(),
+        weights=weights[once].numpy(),
+    )
+
+
+def _conditional(terms: "_BandTerms", chosen: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Probability of each node being in, given the sides of its neighbours.
+
+    On a labelling of least energy a node prefers the side it is on, so that it is more than 0.5
+    for exactly the nodes that are in, up to the rounding of capacities.
+    """
+    sides = np.where(chosen, 1.0, -1.0)
+    field = terms.unary.copy()
+    np.add.at(field, terms.first, terms.weights * sides[terms.second])
+    np.add.at(field, terms.second, terms.weights * sides[terms.first])
+    return 1 / (1 + np.exp(-np.clip(field, -500, 500)))
+
+
+def minimum_cut(
+    unary: NDArray[np.float64],
+    first: NDArray[np.int64],
+    second: NDArray[np.int64],
+    weights: NDArray[np.float64],
+) -> NDArray[np.bool_]:
+    r"""Which nodes are in, for the least :math:`-\sum_i u_i x_i + \sum_e w_e [x_a \ne x_b]`.
+
+    Exact for values that are whole numbers of the unit in which capacities are rounded; of
+    several labellings of least energy, the one with the fewest nodes in.
+
+    Args:
+        unary: u (n,), what is gained by node i being in; negative where it is lost.
+        first: One end a of each edge, each edge once.
+        second: The other end b.
+        weights: w, what an edge costs whose ends differ, 0 or more.
+    """
+    from scipy.sparse import csr_matrix
+    from scipy.sparse.csgraph import breadth_first_order, maximum_flow
+
+    count = len(unary)
+    if not count or not (unary > 0).any():
+        return np.zeros(count, dtype=np.bool_)
+    source, sink = count, count + 1
+    scale = _scale(unary, weights)
+    edge_units = np.rint(weights * scale).astype(np.int32)
+    gains = np.rint(unary * scale).astype(np.int64)
+    nodes = np.arange(count)
+    tails = np.concatenate((first, second, np.full(count, source), nodes))
+    heads = np.concatenate((second, first, nodes, np.full(count, sink)))
+    units = np.concatenate((edge_units, edge_units, np.maximum(gains, 0), np.maximum(-gains, 0)))
+    capacities: Any = csr_matrix(
+        (units.astype(np.int32), (tails, heads)), shape=(count + 2, count + 2)
+    )
+    capacities.eliminate_zeros()
+    flow = maximum_flow(capacities, source, sink).flow
+    residual = capacities - flow
+    residual.data = np.maximum(residual.data, 0)
+    residual.eliminate_zeros()
+    reached = breadth_first_order(residual, source, return_predecessors=False)
+    result = np.zeros(count + 2, dtype=np.bool_)
+    result[reached] = True
+    return result[:count]
+
+
+def _scale(unary: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
+    """Units of capacity per unit of energy: as fine as whole numbers of 32 bits allow."""
+    largest = max(float(np.abs(unary).max()), float(weights.max(initial=0.0)))
+    # No flow is more than what leaves the source, or what enters the sink.
+    flow = min(float(np.maximum(unary, 0).sum()), float(np.maximum(-unary, 0).sum()))
+    return min(
+        _MAX_CAPACITY / max(largest, 1e-300),
+        (_MAX_FLOW - len(unary)) / max(flow, 1e-300),
+    )

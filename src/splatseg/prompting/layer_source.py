@@ -1,15 +1,24 @@
 r"""A layer as a source: what belongs together was decided when the scene was segmented.
 
 A click means the id that its pixel shows, the one with the largest blending weight in its row of
-W, as in a label map, unless it is at the rim of something smaller (`_near_click`). Of a tree it
-means a node on the path of that id. How sure the answer is
-comes from the layer: with the evidence :math:`s_{in}` for the ids that were chosen and
-:math:`s_{out}` for the strongest other one,
+W, as in a label map, unless it is at the rim of something smaller. People click at things, not at
+areas, and miss by a pixel; and the rims of small things are where masks err. So the pixels around a
+click have a say, less the farther they are, and a small thing is likelier meant than a large one.
+With the distances :math:`d_p` of pixels from the click, in pixels, and the :math:`n_k` Gaussians of
+a thing k, a click means the k of the largest
+
+.. math:: \frac{1}{\sqrt{n_k}} \sum_{p \text{ shows } k} e^{-d_p^2 / 2}.
+
+Of a tree it means a node on the path of that id. How sure the answer is comes from the layer: with
+the evidence :math:`s_{in}` for the ids that were chosen and :math:`s_{out}` for the strongest other
+one,
 
 .. math:: c = \frac{s_{in}}{s_{in} + s_{out}}.
 """
 
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int, Int64
@@ -19,12 +28,87 @@ from splatseg.core import UNLABELLED, Gaussians, InstanceTree, Labels, Layer, Se
 from splatseg.core.boundary import boundary
 from splatseg.core.instance_tree import layer_kind
 from splatseg.errors import InputError, ShapeError
-from splatseg.prompting._layer_regions import RegionCounts, best_ids, region_counts
-from splatseg.prompting._near_click import Claim, agreed, claim, pixels_around
-from splatseg.prompting._tree_choice import TreeChoice
-from splatseg.prompting.seen import SeenPrompt
-from splatseg.prompting.view_cache import ViewCache
+from splatseg.prompting.seen import SeenPrompt, ViewCache
+from splatseg.prompting.tree_choice import RegionCounts, TreeChoice, best_ids, region_counts
 from splatseg.render import SparseWeights
+
+_REACH = 3
+"""Pixels to each side that have a say; what is farther would have less than 1 %."""
+
+_SHARED = 0.2
+"""Share of what other clicks mean around a click from which on it is at their border."""
+
+
+def pixels_around(
+    pixel: Int64[Tensor, "2"], height: int, width: int
+) -> tuple[Int64[Tensor, "p 2"], Tensor]:
+    """Pixels of a picture around one, column and row, and how much each has to say."""
+    steps = torch.arange(-_REACH, _REACH + 1)
+    offsets = torch.cartesian_prod(steps, steps)
+    pixels = pixel.cpu() + offsets
+    inside = ((pixels >= 0) & (pixels < torch.tensor([width, height]))).all(dim=1)
+    votes = torch.exp(-0.5 * offsets[inside].double().square().sum(dim=1))
+    return pixels[inside], votes
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NearestId:
+    """What a click means."""
+
+    id: int
+    """Of the ids of the thing, the one that most pixels around the click show."""
+
+    thing: int
+    shares: Mapping[int, float]
+    """Of each thing around the click, its share in what the pixels say; they add up to 1."""
+
+
+def nearest_id(
+    ids: Sequence[int],
+    votes: Sequence[float],
+    *,
+    thing_of: Callable[[int], int],
+    sizes: Mapping[int, int],
+) -> NearestId:
+    """What a click means; of equal ones the smaller thing, then id.
+
+    Args:
+        ids: What the pixels around it show, at least one.
+        votes: How much each has to say.
+        thing_of: The thing that an id is of.
+        sizes: Gaussians of each thing.
+    """
+    of_id: dict[int, float] = defaultdict(float)
+    of_thing: dict[int, float] = defaultdict(float)
+    for id, vote in zip(ids, votes, strict=True):
+        of_id[id] += vote
+        of_thing[thing_of(id)] += vote
+    size = {thing: max(1, sizes.get(thing, 0)) for thing in of_thing}
+    best = min(of_thing, key=lambda t: (-of_thing[t] / size[t] ** 0.5, size[t], t))
+    own = [id for id in of_id if thing_of(id) == best]
+    total = sum(of_thing.values())
+    return NearestId(
+        id=min(own, key=lambda id: (-of_id[id], id)),
+        thing=best,
+        shares={thing: vote / total for thing, vote in of_thing.items()},
+    )
+
+
+def agreed(nearest: Sequence[NearestId]) -> list[int]:
+    """Ids that several clicks on one thing mean together, each once.
+
+    A click at the border of what another click means already says that this much belongs to the
+    thing, and not that all of the neighbour does: it adds nothing.
+    """
+    found: dict[int, None] = {}
+    things: set[int] = set()
+    # Clicks in the middle of something come before those at borders.
+    for one in sorted(nearest, key=lambda one: -one.shares[one.thing]):
+        if one.thing in things or sum(one.shares.get(t, 0) for t in things) < _SHARED:
+            things.add(one.thing)
+            found[one.id] = None
+    return list(found)
+
 
 _MIN_STROKE_SHARE = 0.2
 """Least share of the pixels of the id that a stroke shows most of, with which another one is meant
@@ -87,7 +171,7 @@ class LayerSource:
     def membership(
         self, prompts: Sequence[SeenPrompt], *, granularity: float | None = None
     ) -> Float[Tensor, "n"]:
-        """How likely each Gaussian belongs to what is shown, see `sources.MembershipSource`.
+        """How likely each Gaussian belongs to what is shown, see `MembershipSource`.
 
         Raises:
             InputError: If no positive prompt is on anything that the layer has a label for, or
@@ -163,7 +247,7 @@ class LayerSource:
             granularity: How large things are.
             hidden: Ids at negative points; only a click right on them means them.
         """
-        claims: list[Claim] = []
+        nearest: list[NearestId] = []
         for one in prompts:
             for pixel in () if one.dense else one.pixels[one.positive].cpu():
                 camera = one.view.camera
@@ -171,15 +255,15 @@ class LayerSource:
                 ids = shown_ids(self._labels, self._views.prepared(one.view).weights(pixels))
                 own = (pixels == pixel).all(dim=1)
                 said = own | torch.tensor([id not in hidden for id in ids.tolist()])
-                claims.append(
-                    claim(
+                nearest.append(
+                    nearest_id(
                         ids[said].tolist(),
                         votes[said].tolist(),
                         thing_of=lambda id: self._thing_of(id, granularity),
                         sizes=self._sizes,
                     )
                 )
-        return [id for id in agreed(claims) if id != UNLABELLED]
+        return [id for id in agreed(nearest) if id != UNLABELLED]
 
     def _thing_of(self, id: int, granularity: float | None) -> int:
         """The node that an id is of at a granularity; the id itself where there is no tree."""

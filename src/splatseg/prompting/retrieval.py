@@ -6,9 +6,8 @@ the negative score that with a negative one,
 .. math:: S^p = \max_{Q \in \mathcal{Q}^p} \langle f, Q \rangle, \quad
           S^n = \max_{Q \in \mathcal{Q}^n} \langle f, Q \rangle,
 
-and it belongs to the target if :math:`S^p > S^n` and :math:`S^p > \tau`. The threshold is a
-number here; the rules that it is made by are functions below. A readable twin of the kernel is
-`splatseg.prompting.reference`.
+and it belongs to the target if :math:`S^p > S^n` and :math:`S^p > \tau`. The rules that the
+threshold is made by are functions below. A readable twin of the kernel is in the tests.
 """
 
 import math
@@ -16,7 +15,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Float, Float32
 from torch import Tensor
 
 from splatseg._check import check_choice, check_finite, check_shape
@@ -32,6 +31,8 @@ MAX_CHANNELS = 1024
 _DTYPES = {"float32": torch.float32, "float16": torch.float16, "int8": torch.int8}
 _HALF_MAX = 65504.0
 _INT8_MAX = 127.0
+_TOP = 0.1
+"""Share of the Gaussians that the published code retrieves at most."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,25 +118,6 @@ class StoredFeatures:
         scales = 0 if self.scales is None else self.scales.nbytes
         return self.panels.nbytes + scales
 
-    def unpacked(self) -> Float32[Tensor, "n d"]:
-        """The features as they are stored, rounding included."""
-        rows = self.panels.transpose(1, 2).reshape(-1, self.channels)[: self.rows].float()
-        return rows if self.scales is None else rows * self.scales.unsqueeze(1)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Retrieved:
-    """Which Gaussians match, and how well."""
-
-    mask: Bool[Tensor, "n"]
-    """Those with a positive score above the negative one and above the threshold."""
-
-    positive: Float32[Tensor, "n"]
-    """The largest similarity with a positive query."""
-
-    negative: Float32[Tensor, "n"] | None
-    """The largest similarity with a negative query; None without such queries."""
-
 
 @boundary
 def scores(
@@ -161,126 +143,52 @@ def scores(
         ShapeError: If queries or gate do not fit the features, or there is no query.
         RangeError: If a value is not finite.
     """
-    result = torch.empty(features.rows)
-    folded = _folded("queries", features, queries, gate)
+    folded = _folded(features, queries, gate)
     if not len(folded):
         raise ShapeError("queries: expected at least one query, got none.")
-    _match(features, folded, folded[:0], gate=gate, threshold=math.inf, out=(result, None, None))
+    result = torch.empty(features.rows)
+    gated = gate is not None and features.similarity == "cosine"
+    squared = gate.detach().cpu().float().square() if gate is not None and gated else None
+    half = features.panels.dtype == torch.float16
+    panels = features.panels.view(torch.int16) if half else features.panels
+    rows, scales, nobody = features.rows, features.scales, folded[:0]
+    match_features(panels, rows, scales, folded, nobody, squared, math.inf, result, None, None)
     return result
 
 
-@boundary
-def retrieve(
-    features: StoredFeatures,
-    positive: Float[Tensor, "q d"],
-    negative: Float[Tensor, "r d"] | None = None,
-    *,
-    threshold: float,
-    gate: Float[Tensor, "d"] | None = None,
-) -> Retrieved:
-    """The Gaussians that match positive queries better than negative ones, in one pass.
-
-    Args:
-        features: The features of the Gaussians.
-        positive: At least one query.
-        negative: Queries of what is not meant; None for none.
-        threshold: What a positive score must be above; see `mean_threshold`,
-            `deviation_threshold` and `published_threshold`.
-        gate: As in `scores`.
-
-    Raises:
-        ShapeError: If queries or gate do not fit the features, or there is no positive query.
-        RangeError: If a value is not finite, or the threshold NaN.
-    """
-    if math.isnan(threshold):
-        raise RangeError("threshold: expected a number, got nan.")
-    asked = _folded("positive", features, positive, gate)
-    if not len(asked):
-        raise ShapeError("positive: expected at least one query, got none.")
-    against = asked[:0] if negative is None else _folded("negative", features, negative, gate)
-    above = torch.empty(features.rows)
-    below = torch.empty(features.rows) if len(against) else None
-    mask = torch.empty(features.rows, dtype=torch.uint8)
-    _match(features, asked, against, gate=gate, threshold=threshold, out=(above, below, mask))
-    return Retrieved(mask=mask.view(torch.bool), positive=above, negative=below)
-
-
-@boundary
 def mean_threshold(positive: Float[Tensor, "n"]) -> float:
     """The mean of the positive scores: section 3.4, prompts of points, scribbles and masks."""
     return float(positive.double().mean()) if len(positive) else 0.0
 
 
-@boundary
-def deviation_threshold(positive: Float[Tensor, "n"], *, deviations: float = 1.0) -> float:
-    """Mean and standard deviations of the positive scores: section 3.4, SAM-based prompts."""
+def deviation_threshold(positive: Float[Tensor, "n"]) -> float:
+    """Mean and standard deviation of the positive scores: section 3.4, SAM-based prompts."""
     if not len(positive):
         return 0.0
     wide = positive.double()
-    return float(wide.mean() + deviations * wide.std(correction=0))
+    return float(wide.mean() + wide.std(correction=0))
 
 
-@boundary
-def published_threshold(
-    positive: Float[Tensor, "n"], in_mask: Float[Tensor, "p"], *, top: float = 0.1
-) -> float:
+def published_threshold(positive: Float[Tensor, "n"], in_mask: Float[Tensor, "p"]) -> float:
     """The threshold of the published code: the largest of three.
 
-    Args:
-        positive: Scores of the Gaussians.
-        in_mask: Scores of the rendered features of the pixels in the prompt's mask.
-        top: Share of the Gaussians that may be retrieved at most.
-
-    Returns:
-        The largest of mean and standard deviation of `in_mask`, of the score that the best `top`
-        of the Gaussians are above, and of 0.
-
-    Raises:
-        RangeError: If `top` is not within (0, 1].
+    Mean and standard deviation of the scores of the rendered features of the pixels in the
+    prompt's mask, the score that the best tenth of the Gaussians are above, and 0.
     """
-    if not 0 < top <= 1:
-        raise RangeError(f"top: expected a share in (0, 1], got {top}.")
-    highest = 0.0
-    if len(in_mask):
-        highest = max(highest, deviation_threshold(in_mask))
-    kept = int(top * len(positive))
+    highest = deviation_threshold(in_mask) if len(in_mask) else 0.0
+    highest = max(0.0, highest)
+    kept = int(_TOP * len(positive))
     if len(positive) and kept < len(positive):
-        rank = len(positive) - kept
-        highest = max(highest, float(positive.kthvalue(rank).values))
+        highest = max(highest, float(positive.kthvalue(len(positive) - kept).values))
     return highest
 
 
-def _match(
-    features: StoredFeatures,
-    positive: Tensor,
-    negative: Tensor,
-    *,
-    gate: Tensor | None,
-    threshold: float,
-    out: tuple[Tensor, Tensor | None, Tensor | None],
-) -> None:
-    gated = gate is not None and features.similarity == "cosine"
-    squared = gate.detach().cpu().float().square() if gate is not None and gated else None
-    match_features(
-        features.panels.view(torch.int16)
-        if features.panels.dtype == torch.float16
-        else features.panels,
-        features.rows,
-        features.scales,
-        positive,
-        negative,
-        squared,
-        threshold,
-        *out,
-    )
-
-
 def _folded(
-    name: str, features: StoredFeatures, queries: Tensor, gate: Tensor | None
+    features: StoredFeatures, queries: Tensor, gate: Tensor | None
 ) -> Float32[Tensor, "q d"]:
     """Queries as the kernel takes them: with the gate of the features, normalised."""
-    check_shape(name, queries, (None, features.channels))
-    check_finite(name, queries)
+    check_shape("queries", queries, (None, features.channels))
+    check_finite("queries", queries)
     asked = queries.detach().cpu().float()
     if gate is None:
         return (_normalised(asked) if features.similarity == "cosine" else asked).contiguous()

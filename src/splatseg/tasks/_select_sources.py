@@ -19,10 +19,14 @@ from splatseg.io.evidence import evidence_names, find_evidence, open_evidence
 from splatseg.io.scene import scene_layer_names
 from splatseg.lift.affinity import KIND
 from splatseg.methods.saga import trained_as_published
-from splatseg.prompting.feature_source import FeatureSource, FeatureSourceOptions, ThresholdRule
+from splatseg.prompting.feature_source import (
+    FeatureMembership,
+    FeatureMembershipOptions,
+    ThresholdRule,
+)
 from splatseg.prompting.layer_source import LayerSource
-from splatseg.prompting.sources import MembershipSource
-from splatseg.prompting.view_cache import ViewCache
+from splatseg.prompting.pipeline import MembershipSource
+from splatseg.prompting.seen import ViewCache
 from splatseg.render import BackendName
 from splatseg.tasks._observer import Observer
 from splatseg.tasks.scene_parts import whole_layer
@@ -196,10 +200,10 @@ def _open_features(offer: Offer) -> OpenedSource | None:
     published = trained_as_published(layer.info)
     asked = offer.options.threshold
     rule = ("adaptive" if published else "fixed") if asked == "auto" else asked
-    source = FeatureSource(
+    source = FeatureMembership(
         layer,
         offer.scene.gaussians,
-        options=FeatureSourceOptions(rule=rule, seed=offer.options.seed),
+        options=FeatureMembershipOptions(rule=rule, seed=offer.options.seed),
         guidance=_guidance(offer, layer),
     )
     offer.observer.note(f"selecting by features {name}, threshold {rule}")

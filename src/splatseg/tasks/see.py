@@ -18,6 +18,7 @@ from splatseg.io.evidence import (
 from splatseg.io.scene import check_name
 from splatseg.io.scene_folder import scene_path, work_on_scene
 from splatseg.models import (
+    EvidenceRequest,
     LoadOptions,
     ModelCache,
     SeenEvidence,
@@ -116,8 +117,8 @@ def see(
         model: The model; or the name of one, or a file or folder of evidence recorded elsewhere.
         evidence: Name of the evidence to write.
         options: What is asked.
-        model_options: Options of the model's family, such as `RegionOptions` of ``classical``; None
-            takes its defaults.
+        model_options: Options of the model's family, such as `ClassicalOptions`; None takes its
+            defaults.
         loading: The model's weights, and where and how it runs.
         backend: Who renders views without photographs.
         observer: Is told of the progress.
@@ -150,14 +151,16 @@ def see(
             found,
             views,
             folder,
-            what=options.what or None,
-            asked=views_recorded(options.views),
-            overwrite=options.overwrite,
-            missing="skip" if options.allow_missing else "refuse",
-            cache=cache,
-            seeds=seeds,
-            tracking=tracking,
-            image_of=images,
+            EvidenceRequest(
+                what=options.what,
+                view_spec=views_recorded(options.views),
+                overwrite=options.overwrite,
+                allow_missing=options.allow_missing,
+                cache=cache,
+                seeds=seeds,
+                tracking=tracking,
+                image_of=images,
+            ),
             progress=step,
         )
     if images.drawn:

@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 
 from splatseg.core import Layer, PromptableMasks, Scene, Selection
 from splatseg.core.boundary import boundary
+from splatseg.prompting.pipeline import MembershipSource
 from splatseg.prompting.prompts import SelectionPrompt
-from splatseg.prompting.sources import MembershipSource
 from splatseg.render import BackendName
 from splatseg.tasks._observer import SILENT, Observer
 from splatseg.tasks.select_options import SelectOptions

@@ -13,10 +13,12 @@ from torch import Tensor
 from splatseg.core import JSON, Gaussians, Layer, LayerInfo, PromptableMasks, Scene, Selection
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, ShapeError
-from splatseg.prompting.context import PostProcessing, SceneIndex
+from splatseg.prompting.next_click import NextClick
 from splatseg.prompting.pipeline import (
-    NextClickHint,
+    MembershipSource,
+    SceneIndex,
     SelectionContext,
+    SimilaritySource,
     StepName,
     checked_membership,
     next_click,
@@ -31,9 +33,7 @@ from splatseg.prompting.prompts import (
     Solid,
     ViewPrompt,
 )
-from splatseg.prompting.seen import PromptOptions, SeenPrompt, see_prompts
-from splatseg.prompting.sources import MembershipSource, SimilaritySource
-from splatseg.prompting.view_cache import ViewCache
+from splatseg.prompting.seen import SeenPrompt, ViewCache, see_prompts
 from splatseg.render import BackendName
 from splatseg.tasks._observer import SILENT, Observer
 from splatseg.tasks._select_prompter import segmented_prompts
@@ -56,7 +56,7 @@ class Selected:
     source: str
     """What said which Gaussians belong together; empty where places alone did."""
 
-    next_click: NextClickHint | None = None
+    next_click: NextClick | None = None
     """Where one more click would help most; None where nobody asked, or nothing is uncertain."""
 
     warnings: tuple[str, ...] = ()
@@ -234,8 +234,13 @@ class SelectionSession:
         seen: tuple[SeenPrompt, ...] = ()
         if shown:
             began = time.perf_counter()
-            how = PromptOptions(max_pixels=options.max_pixels, seed=options.seed)
-            seen = see_prompts(self._scene.gaussians, shown, options=how, views=self._views)
+            seen = see_prompts(
+                self._scene.gaussians,
+                shown,
+                max_pixels=options.max_pixels,
+                seed=options.seed,
+                views=self._views,
+            )
             seconds["see"] = time.perf_counter() - began
         return SelectionContext(
             gaussians=self._scene.gaussians,
@@ -245,11 +250,8 @@ class SelectionSession:
             unseen=None if self._opened is None else getattr(self._opened.source, "unseen", None),
             scene_views=self._scene.train_views,
             source="" if self._opened is None else self._opened.name,
-            post_processing=(
-                PostProcessing.published() if self._published(options) else PostProcessing()
-            ),
+            published=self._published(options),
             granularity=options.level,
-            seed=options.seed,
         )
 
     def _membership(

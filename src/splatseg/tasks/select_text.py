@@ -21,10 +21,9 @@ from splatseg.methods.prompt import (
     PromptSources,
     selection_of,
 )
-from splatseg.prompting.context import SceneIndex
-from splatseg.prompting.pipeline import SelectionContext, postprocess
+from splatseg.prompting.pipeline import SceneIndex, SelectionContext, postprocess
 from splatseg.prompting.prompts import Solid, ViewPrompt
-from splatseg.prompting.view_cache import ViewCache
+from splatseg.prompting.seen import ViewCache
 from splatseg.render import BackendName
 from splatseg.tasks._observer import SILENT, Observer
 from splatseg.tasks._query_sources import feature_evidence, mask_name
@@ -176,7 +175,6 @@ def _cleaned(
             views=views,
             neighbours=SceneIndex(scene.gaussians),
             source="text",
-            seed=options.seed,
         )
         return postprocess(confidence, context, enabled=options.steps)
 

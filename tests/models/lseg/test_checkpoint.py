@@ -11,9 +11,8 @@ import torch
 from safetensors.torch import save_file
 
 from splatseg.errors import FileFormatError, MissingFileError
-from splatseg.models.lseg._layout import network_of, published_name, published_tensors
-from splatseg.models.lseg._reading import read_checkpoint
-from splatseg.models.lseg._sizes import Sizes
+from splatseg.models._lseg_network import Sizes
+from splatseg.models.lseg import network_of, published_name, published_tensors, read_checkpoint
 from support.checkpoints_lseg import CHANNELS, DECODER, extras, published, shapes
 
 FULL = shapes(

@@ -7,16 +7,17 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from splatseg.models.lseg._layout import network_of
-from splatseg.models.lseg._sizes import Sizes
-from splatseg.models.lseg._transformer import Attention, Block
-from splatseg.models.lseg._vision import (
+from splatseg.models._lseg_network import (
+    Attention,
+    Block,
     DensePredictionTransformer,
     Fusion,
     ImageTransformer,
     Reassemble,
     ResidualUnit,
+    Sizes,
 )
+from splatseg.models.lseg import network_of
 from support.checkpoints_lseg import (
     BLOCKS,
     CHANNELS,

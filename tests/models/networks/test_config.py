@@ -5,16 +5,26 @@ import json
 import os
 import shutil
 import socket
+import subprocess
+import sys
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 
+import support
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.models import LoadOptions, find_model
-from splatseg.models.networks._config import offline
-from splatseg.models.networks._config_keys import FLAGS, NUMBERS, WORDS
+from splatseg.models.networks._config import (
+    FLAGS,
+    NUMBERS,
+    WORDS,
+    checked_config,
+    library_config,
+    offline,
+)
 from splatseg.models.networks._library import side_of
 from support.networks import IMAGE, KINDS, asked, checkpoint, in_parts
 
@@ -342,3 +352,182 @@ def test_nothing_reaches_the_hub_while_a_library_loads() -> None:
     with offline():
         assert constants.HF_HUB_OFFLINE is True
     assert constants.HF_HUB_OFFLINE is before
+
+
+# What published weights say in config.json is taken, and reaches the library as it is.
+
+
+TYPES = (
+    *("clip", "clipseg", "depth_anything", "dinov2", "dinov2_with_registers", "dinov3_vit", "dpt"),
+    *("eomt", "eomt_dinov3", "grounding-dino", "mask2former", "maskformer", "mm-grounding-dino"),
+    *("oneformer", "sam", "sam2", "sam2_video", "sam3", "sam3_tracker", "sam3_tracker_video"),
+    *("sam3_video", "sam_hq", "segformer", "siglip", "siglip2", "vit"),
+)
+EARLIER = {
+    "_commit_hash": None, "_name_or_path": "", "add_cross_attention": False, "architectures": None,
+    "bad_words_ids": None, "chunk_size_feed_forward": 0, "diversity_penalty": 0.0,
+    "do_sample": False, "early_stopping": False, "finetuning_task": None, "is_decoder": False,
+    "length_penalty": 1.0, "max_length": 20, "min_length": 0, "num_beams": 1,
+    "output_attentions": False, "problem_type": None, "pruned_heads": {}, "return_dict": True,
+    "sep_token_id": None, "temperature": 1.0, "tf_legacy_loss": False, "tie_encoder_decoder": False,
+    "tie_word_embeddings": True, "top_k": 50, "torch_dtype": "float32", "torchscript": False,
+    "transformers_version": "4.29.0.dev0", "typical_p": 1.0, "use_bfloat16": False,
+}  # fmt: skip
+"""What files of releases 4 hold, of every network."""
+
+STAGES = {"stage_names": ["stem", *(f"stage{i}" for i in range(1, 13))]}
+UNNAMED = {
+    "backbone": None, "backbone_kwargs": None, "use_timm_backbone": False,
+    "use_pretrained_backbone": False,
+}  # fmt: skip
+OWN = {
+    "depth_anything": UNNAMED,
+    "dinov2": {**STAGES, "out_features": ["stage12"], "out_indices": [12]},
+    "dinov2_with_registers": {"interpolate_antialias": True, "interpolate_offset": 0.0},
+    "grounding-dino": UNNAMED,
+    "mm-grounding-dino": UNNAMED,
+    "oneformer": {"max_seq_len": 77, "num_classes": 150},
+    "sam2_video": {
+        "memory_attention_rope_k_sizes": [16, 16],
+        "preserve_temporal_direction_in_object_pointers": True,
+        "project_temporal_pos_encoding_in_object_pointers": True,
+    },
+    "segformer": {"downsampling_rates": [1, 4, 8, 16], "reshape_last_stage": True},
+}
+"""What files of one network hold besides its settings of today."""
+
+CHANGED = {"out_features", "out_indices", "tie_word_embeddings", "torch_dtype", "return_dict"}
+
+
+def read(tmp_path, kind: str, content: dict) -> dict:
+    """What the library makes of a file, but for numbers of classes, which `id2label` says."""
+    path = tmp_path / "config.json"
+    path.write_text(json.dumps(content))
+    auto = importlib.import_module("transformers.models.auto.configuration_auto")
+    network = SimpleNamespace(config_class=auto.CONFIG_MAPPING[kind], __name__=kind)
+    made, rest = library_config(path, checked_config(path, (kind,)), network)
+    assert rest == {}
+    return settings(json.loads(made.to_json_string(use_diff=False)))
+
+
+def settings(content: dict) -> dict:
+    """Values by dotted names."""
+    found = {}
+    for key, value in content.items():
+        inner = value if isinstance(value, dict) and key != "label2id" else None
+        below = {key: value} if inner is None else settings(inner)
+        found |= {name if inner is None else f"{key}.{name}": one for name, one in below.items()}
+    return {name: one for name, one in found.items() if not name.endswith("label2id")}
+
+
+@pytest.mark.parametrize("kind", TYPES)
+def test_what_the_library_saves(tmp_path, kind) -> None:
+    auto = importlib.import_module("transformers.models.auto.configuration_auto")
+    saved = json.loads(auto.CONFIG_MAPPING[kind]().to_json_string(use_diff=False))
+    found = read(tmp_path, kind, saved)
+    assert found == settings(saved)
+    added = EARLIER | OWN.get(kind, {})
+    earlier = {key: value for key, value in added.items() if key not in saved or key in CHANGED}
+    for key, value in saved.items():
+        if key.endswith("_config") and isinstance(value, dict):
+            saved[key] = value | {one: EARLIER[one] for one in EARLIER if one not in value}
+            saved[key] |= {"gradient_checkpointing": False, "path_norm": True} | STAGES
+    later = read(tmp_path, kind, saved | earlier)
+    changed = {name for name in found if found[name] != later[name]}
+    assert {name.rsplit(".")[-1] for name in changed} <= CHANGED
+
+
+# No family of networks lets its weights call the package kernels, which fetches and runs code.
+
+
+FAKE = """
+from pathlib import Path
+
+CALLS = Path(__file__).with_name("calls")
+
+def __getattr__(name):
+    if name.startswith("__"):
+        raise AttributeError(name)
+    def called(*words, **more):
+        CALLS.open("a").write(name + chr(10))
+        raise OSError("no kernels here")
+    return called
+
+def unchanged(*words, **more):  # what the library decorates its classes with, at import
+    return lambda wrapped: wrapped
+
+use_kernel_forward_from_hub = use_kernelized_func = unchanged
+"""
+ASK = """
+import json
+import sys
+from pathlib import Path
+
+import transformers
+
+from splatseg.errors import FileFormatError
+from support.networks import asked
+
+packages, checkpoints = Path(sys.argv[1]), json.loads(sys.argv[2])
+calls = packages / "kernels" / "calls"
+HUB = "kernels-community/flash-attn2"
+others = {"use_kernels": True, "kernel_config": {"a": HUB}, "experts_implementation": HUB}
+for family, folder in checkpoints:
+    file = Path(folder) / "config.json"
+    sound = file.read_text()
+    names = [key for key, value in json.loads(sound).items() if isinstance(value, dict)]
+    parts = [None, *(name for name in names if name.endswith("_config"))]
+    for part in parts:
+        for key in ("attn_implementation", "_attn_implementation", "_attn_implementation_internal"):
+            content = json.loads(sound)
+            (content if part is None else content[part])[key] = HUB
+            file.write_text(json.dumps(content))
+            try:
+                asked(family, Path(folder))
+            except FileFormatError as error:
+                known = f"{key}: expected eager or sdpa" in str(error)
+                print(family, "refused" if known else error)
+            else:
+                print(family, "took", part, key)
+    content = json.loads(sound)
+    for part in parts:
+        (content if part is None else content[part]).update(others)
+    file.write_text(json.dumps(content))
+    asked(family, Path(folder))
+print("calls", calls.exists())
+content["attn_implementation"] = HUB
+file.write_text(json.dumps(content))
+try:
+    transformers.AutoModel.from_pretrained(folder)
+except Exception:
+    print("calls of the library itself", calls.read_text().split())
+"""
+
+
+def test_kernels_are_never_called(tmp_path) -> None:
+    from transformers.utils.import_utils import KERNELS_MIN_VERSION
+
+    packages = tmp_path / "packages"
+    (packages / "kernels" / "layer").mkdir(parents=True)
+    (packages / "kernels" / "__init__.py").write_text(FAKE)
+    (packages / "kernels" / "layer" / "__init__.py").touch()
+    (packages / "kernels" / "layer" / "mode.py").write_text("Mode = object\n")
+    about = packages / f"kernels-{KERNELS_MIN_VERSION}.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text(
+        f"Metadata-Version: 2.1\nName: kernels\nVersion: {KERNELS_MIN_VERSION}\n"
+    )
+    names = [name for name in KINDS if name != "dinov2"] + ["dinov2"]
+    folders = [(KINDS[name][0], str(checkpoint(*KINDS[name], tmp_path))) for name in names]
+    tests = str(Path(support.__path__[0]).parent)
+    paths = os.pathsep.join([str(packages), tests, os.environ.get("PYTHONPATH", "")])
+    done = subprocess.run(
+        [sys.executable, "-c", ASK, str(packages), json.dumps(folders)],
+        capture_output=True, text=True, env={**os.environ, "PYTHONPATH": paths},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    *said, ours, theirs = done.stdout.splitlines()
+    assert {line.split(maxsplit=1)[1] for line in said} == {"refused"}, said
+    assert {line.split()[0] for line in said} == {family for family, _ in KINDS.values()}
+    assert ours == "calls False"
+    assert theirs == "calls of the library itself ['get_kernel']", "the fake is what it asks"

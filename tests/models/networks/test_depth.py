@@ -9,7 +9,7 @@ from splatseg.core.models import BatchedModel, DenseDepth
 from splatseg.errors import FileFormatError, RangeError
 from splatseg.models import LoadOptions, find_model
 from splatseg.models._images import IMAGENET
-from splatseg.models.networks.depth import UNUSED_OF_DPT, DepthOptions
+from splatseg.models.networks.dense import _UNUSED_OF_DPT, DepthOptions
 
 KINDS = [("depth-anything", "depth_anything", "relative"),
          ("depth-anything", "depth_anything_metric", "metric"),
@@ -94,7 +94,7 @@ def test_published_weights_may_lack_what_nothing_needs(checkpoints, rng, tmp_pat
     folder = tmp_path / "weights"
     shutil.copytree(checkpoints("dpt"), folder)
     weights = load_file(folder / "model.safetensors")
-    kept = {k: v for k, v in weights.items() if not k.startswith(UNUSED_OF_DPT)}
+    kept = {k: v for k, v in weights.items() if not k.startswith(_UNUSED_OF_DPT)}
     assert len(kept) < len(weights)
     save_file(kept, folder / "model.safetensors", metadata={"format": "pt"})
     picture = image(rng, 64, 64)

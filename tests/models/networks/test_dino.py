@@ -4,10 +4,10 @@ import pytest
 import torch
 
 from splatseg.core.models import BatchedModel, DenseFeatures
-from splatseg.errors import BackendError, FileFormatError, RangeError
+from splatseg.errors import BackendError, FileFormatError, InputError, RangeError
 from splatseg.models import LoadOptions, find_model
 from splatseg.models._images import IMAGENET
-from splatseg.models.networks.dino import DinoOptions
+from splatseg.models.networks.dense import DinoOptions
 
 KINDS = [("dino", "dino"), ("dinov2", "dinov2"), ("dinov2", "dinov2_with_registers"),
          ("dinov3", "dinov3")]  # fmt: skip
@@ -74,14 +74,14 @@ def test_depths_and_normalisation(checkpoints, rng) -> None:
     two = made(checkpoints, "dinov2", "dinov2", size=56, depths=2).features(picture)
     assert (one.depths, two.depths) == (("block4",), ("block2", "block4"))
     assert torch.equal(one.maps[-1].features, two.maps[-1].features)
-    raw = made(checkpoints, "dinov2", "dinov2", size=56, normalise=False).features(picture)
-    assert not torch.allclose(raw.maps[-1].features, one.maps[-1].features)
     deviation = one.maps[-1].features.std(dim=2, correction=0)
     torch.testing.assert_close(deviation, torch.ones_like(deviation), rtol=0, atol=1e-3)
     with pytest.raises(RangeError, match=r"depths: expected at most the 4 blocks of dinov2, got 5"):
         made(checkpoints, "dinov2", "dinov2", size=56, depths=5)
     with pytest.raises(RangeError, match="depths"):
         DinoOptions(depths=0)
+    with pytest.raises(InputError, match="normalise: this option was removed; features always"):
+        DinoOptions(normalise=False)
 
 
 def test_images_together_are_as_one_by_one(checkpoints, rng, monkeypatch) -> None:

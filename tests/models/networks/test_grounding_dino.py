@@ -10,6 +10,7 @@ import torch
 from splatseg.core.models import GroundedBoxes
 from splatseg.errors import FileFormatError, InputError, RangeError
 from splatseg.models import LoadOptions, find_model, record_evidence
+from splatseg.models.networks import grounding_dino
 from splatseg.models.networks.grounding_dino import (
     GroundingDinoOptions,
     found_boxes,
@@ -20,7 +21,13 @@ from support.checkpoints_text import COLOURS
 
 WORDS = ("chair", "red mug", "table")
 KINDS = ["grounding_dino", "mm_grounding_dino"]
-ALL = {"box_threshold": 0.0, "text_threshold": 0.0, "max_overlap": 1.0}
+ALL = {"box_threshold": 0.0, "text_threshold": 0.0}
+
+
+@pytest.fixture(autouse=True)
+def every_box(monkeypatch) -> None:
+    """Boxes that overlap are kept."""
+    monkeypatch.setattr(grounding_dino, "MAX_OVERLAP", 1.0)
 
 
 def made(checkpoints, kind: str = "grounding_dino", *, size=None, **options):
@@ -73,7 +80,7 @@ def test_phrases_and_their_tokens() -> None:
     assert word_tokens(spans, places) == [[1], [3, 4, 5], [7]]
 
 
-def test_a_box_is_of_the_word_of_which_it_fits_most() -> None:
+def test_a_box_is_of_the_word_of_which_it_fits_most(monkeypatch) -> None:
     """Four tokens: chair; red, mug; a token of no word. By hand."""
     probabilities = torch.tensor(
         [
@@ -84,18 +91,19 @@ def test_a_box_is_of_the_word_of_which_it_fits_most() -> None:
         ]
     )
     boxes = torch.tensor([[0.5, 0.5, 0.2, 0.4]] * 4)
-    options = GroundingDinoOptions(box_threshold=0.35, text_threshold=0.25, max_overlap=1.0)
+    options = GroundingDinoOptions(box_threshold=0.35, text_threshold=0.25)
     found = found_boxes(probabilities, boxes, [[0], [1, 2]], options, size=(100, 200))
     assert found.words == (1, 0)
     torch.testing.assert_close(found.scores, torch.tensor([0.6, 0.4]))
     torch.testing.assert_close(found.boxes[0], torch.tensor([80.0, 30, 120, 70]))
     loose = GroundingDinoOptions(box_threshold=0.2, text_threshold=0.25)
+    monkeypatch.setattr(grounding_dino, "MAX_OVERLAP", 0.8)
     assert len(found_boxes(probabilities, boxes, [[0], [1, 2]], loose, size=(9, 9)).words) == 2, (
         "two boxes of chair lie on each other"
     )
-    apart = GroundingDinoOptions(box_threshold=0.2, text_threshold=0.25, max_overlap=1.0)
-    assert found_boxes(probabilities, boxes, [[0], [1, 2]], apart, size=(9, 9)).words == (1, 0, 0)
-    strict = GroundingDinoOptions(box_threshold=0.35, text_threshold=0.65, max_overlap=1.0)
+    monkeypatch.setattr(grounding_dino, "MAX_OVERLAP", 1.0)
+    assert found_boxes(probabilities, boxes, [[0], [1, 2]], loose, size=(9, 9)).words == (1, 0, 0)
+    strict = GroundingDinoOptions(box_threshold=0.35, text_threshold=0.65)
     of = found_boxes(probabilities, boxes, [[0], [1, 2]], strict, size=(9, 9))
     assert of.words == (1,), "with 0.65 only red of the first box speaks, for red mug"
 
@@ -140,9 +148,9 @@ def test_the_input_has_the_sides_that_the_weights_want(checkpoints, tmp_path) ->
 
 def test_settings_and_refusals(checkpoints, rng, views, tmp_path) -> None:
     model = made(checkpoints)
-    for name, value in (("box_threshold", 0.5), ("text_threshold", 0.5), ("max_overlap", 0.5)):
+    for name, value in (("box_threshold", 0.5), ("text_threshold", 0.5)):
         assert made(checkpoints, **{name: value}).settings != model.settings
-        with pytest.raises(RangeError, match=f"{name}: expected 0 to 1, got 2"):
+        with pytest.raises(RangeError, match=rf"{name}: expected a value in \[0, 1\], got 2"):
             GroundingDinoOptions(**{name: 2})
     picture = image(rng, 40, 50)
     assert model.boxes(picture, []).words == ()

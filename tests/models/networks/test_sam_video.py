@@ -13,9 +13,8 @@ from splatseg.core.models import MaskTracker, Prompt
 from splatseg.errors import FileFormatError, MissingPackageError, RangeError, ShapeError
 from splatseg.models import LoadOptions, find_family, find_model
 from splatseg.models._images import IMAGENET, Normalisation, frame_of, network_input
-from splatseg.models.networks import _video_memory, sam_video
-from splatseg.models.networks._video_memory import VideoMemory, session_of
-from splatseg.models.networks.sam_video import SamVideoOptions, highest
+from splatseg.models.networks import sam_video
+from splatseg.models.networks.sam_video import SamVideoOptions, VideoMemory, highest, session_of
 
 KINDS = [("sam2-video", "sam2_video", "Sam2Video"),
          ("sam3-video", "sam3_tracker_video", "Sam3TrackerVideo")]  # fmt: skip
@@ -184,7 +183,7 @@ def test_more_seeds_are_remembered_if_one_wants(checkpoints, rng) -> None:
     )
     assert torch.equal(few["v3"].ids, TWO.ids)
     assert any(not torch.equal(few[f"v{i}"].ids, many[f"v{i}"].ids) for i in (4, 5, 6))
-    with pytest.raises(RangeError, match="seeds_remembered: expected 1 or more, got 0"):
+    with pytest.raises(RangeError, match="seeds_remembered: expected at least 1, got 0"):
         SamVideoOptions(seeds_remembered=0)
 
 
@@ -252,7 +251,7 @@ def test_absent_objects_and_overlaps(checkpoints, rng, monkeypatch) -> None:
     assert highest([7, 4], torch.ones(2, 2, 2), (1, 1)).item() == 4, "of equal ones the lower id"
     assert highest([], torch.zeros(0, 1, 1), (2, 3)).tolist() == [[-1] * 3] * 2
     model = made(checkpoints, "sam2-video", "sam2_video")
-    run = _video_memory.VideoMemory.follow
+    run = sam_video.VideoMemory.follow
     scores = {5: 1.0, 9: 0.0}
 
     def scripted(memory, pixels, seeds):
@@ -260,7 +259,7 @@ def test_absent_objects_and_overlaps(checkpoints, rng, monkeypatch) -> None:
         height = torch.tensor([3.0, 4.0])[:, None, None].expand_as(logits)
         return ids, height, torch.tensor([scores[id] for id in ids])
 
-    monkeypatch.setattr(_video_memory.VideoMemory, "follow", scripted)
+    monkeypatch.setattr(sam_video.VideoMemory, "follow", scripted)
     ids = dict(model.track(video(rng, 2), {"v0": TWO}))["v1"].ids
     assert bool((ids == 5).all()), "9 is said to be absent, as its logit is not above 0"
 
@@ -341,10 +340,10 @@ def test_settings_and_refusals(checkpoints, monkeypatch, tmp_path) -> None:
 
 def test_a_library_whose_session_has_moved(monkeypatch) -> None:
     moved = SimpleNamespace(__version__="9.1")
-    monkeypatch.setattr(_video_memory, "library", lambda: moved)
+    monkeypatch.setattr(sam_video, "library", lambda: moved)
     with pytest.raises(MissingPackageError, match=r"needs Sam2VideoInferenceSession .*\(9.1\) has"):
         session_of("Sam2Video")
     module = SimpleNamespace(Sam2VideoInferenceSession=lambda **options: options)
     moved.Sam2VideoModel = SimpleNamespace(__module__="beside")
-    monkeypatch.setitem(_video_memory.importlib.sys.modules, "beside", module)
+    monkeypatch.setitem(sam_video.importlib.sys.modules, "beside", module)
     assert session_of("Sam2Video", dtype=1) == {"dtype": 1}

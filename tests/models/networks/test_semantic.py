@@ -11,7 +11,7 @@ from splatseg.core.models import BatchedModel, PanopticSegments, SemanticLabels
 from splatseg.errors import FileFormatError
 from splatseg.models import LoadOptions, find_model
 from splatseg.models._images import IMAGENET
-from splatseg.models._queries import SemanticOptions
+from splatseg.models.networks.segmenters import SemanticOptions
 
 KINDS = [("segformer", "segformer"), ("dpt-semantic", "dpt_semantic")]
 

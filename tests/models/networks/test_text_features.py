@@ -11,9 +11,8 @@ import torch.nn.functional as F
 from splatseg.core.models import BatchedModel, TextFeatures, TextFeaturesWithWords
 from splatseg.errors import FileFormatError, InputError, RangeError
 from splatseg.io.evidence import load_text_embeddings, open_evidence
-from splatseg.models import LoadOptions, find_model, record_evidence
-from splatseg.models.networks.clip import ClipOptions
-from splatseg.models.networks.siglip import SiglipOptions, in_patches
+from splatseg.models import EvidenceRequest, LoadOptions, find_model, record_evidence
+from splatseg.models.networks.clip import ClipOptions, SiglipOptions, in_patches
 from support.checkpoints_text import COLOURS
 
 KINDS = [("clip", "clip"), ("siglip2", "siglip"), ("siglip2", "siglip2")]
@@ -37,7 +36,7 @@ def coloured(picture: torch.Tensor) -> torch.Tensor:
 
 
 def network_of(model):
-    return model._towers._network
+    return model._network
 
 
 def rows_of(found) -> torch.Tensor:
@@ -137,7 +136,7 @@ def test_words_are_what_the_text_encoder_gives(checkpoints, family, kind) -> Non
     assert isinstance(model, TextFeaturesWithWords)
     words = ["a chair", "Table"]
     found = model.encode_text(words)
-    tokenizer = model._towers._tokens._tokenizer
+    tokenizer = model._tokens._tokenizer
     with torch.inference_mode():
         for word, vector in zip(words, found, strict=True):
             if family == "clip":
@@ -161,7 +160,7 @@ def test_words_are_what_the_text_encoder_gives(checkpoints, family, kind) -> Non
 
 def test_siglip_reads_lower_case_whatever_its_tokenizer_does(checkpoints, monkeypatch) -> None:
     model = made(checkpoints, "siglip2", "siglip", template="Look, {}")
-    tokens, read = model._towers._tokens, []
+    tokens, read = model._tokens, []
     of = tokens.of
     monkeypatch.setattr(tokens, "of", lambda texts, **more: read.extend(texts) or of(texts, **more))
     model.encode_text(["A Chair"])
@@ -210,7 +209,9 @@ def test_words_are_written_beside_the_features(checkpoints, views, tmp_path, mon
     torch.testing.assert_close(found.vectors, model.encode_text(found.labels))
     again = made(checkpoints, "clip", "clip", words=("sofa",))
     monkeypatch.setattr(again._last, "_run", lambda images: pytest.fail("it looks again"))
-    assert record_evidence(again, views, folder, what="text").kept == 3, "no feature changes"
+    assert record_evidence(again, views, folder, EvidenceRequest(what="text")).kept == 3, (
+        "no feature changes"
+    )
     assert load_text_embeddings(folder).labels == ("sofa", *NEGATIVES)
     recorded = find_model(folder)
     assert isinstance(recorded, TextFeatures)

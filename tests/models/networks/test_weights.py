@@ -108,7 +108,7 @@ def test_devices_that_are_not_there(checkpoints) -> None:
     with pytest.raises(BackendError, match="GPUs that PyTorch sees, got cuda:77"):
         find_model("dinov2", loading=LoadOptions(device="cuda:77"))
     for name in ("batch", "size"):
-        with pytest.raises(RangeError, match=f"{name}: expected 1 or more, got 0"):
+        with pytest.raises(RangeError, match=f"{name}: expected at least 1, got 0"):
             LoadOptions(**{name: 0})
 
 

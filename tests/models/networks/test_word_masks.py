@@ -17,18 +17,30 @@ from splatseg.core.models import (
     GroundedMasks,
     PanopticSegments,
     Prompt,
+    SemanticLabels,
     TextMasks,
 )
 from splatseg.errors import FileFormatError, InputError, MissingFileError, RangeError
 from splatseg.models import LoadOptions, find_model, record_evidence
-from splatseg.models.networks._word_masks import segments_of, text_masks
-from splatseg.models.networks.grounding_dino import GroundingDinoOptions
-from splatseg.models.networks.langsam import LangSamOptions
-from splatseg.models.networks.sam3_text import Sam3TextOptions
+from splatseg.models.networks import grounding_dino
+from splatseg.models.networks.grounding_dino import GroundingDinoOptions, LangSamOptions
+from splatseg.models.networks.word_masks import (
+    ClipSegOptions,
+    Sam3TextOptions,
+    segments_of,
+    text_masks,
+)
+from support.checkpoints_text import COLOURS
 from support.hub import local_hub
 
 WORDS = ("chair", "red mug", "table")
-ALL = {"box_threshold": 0.0, "text_threshold": 0.0, "max_overlap": 1.0}
+ALL = {"box_threshold": 0.0, "text_threshold": 0.0}
+
+
+@pytest.fixture(autouse=True)
+def every_box(monkeypatch) -> None:
+    """Boxes that overlap are kept."""
+    monkeypatch.setattr(grounding_dino, "MAX_OVERLAP", 1.0)
 
 
 def image(rng, height: int, width: int) -> torch.Tensor:
@@ -124,7 +136,6 @@ def test_langsam_finds_other_words_than_its_own(checkpoints, rng) -> None:
     assert len(langsam(checkpoints, box_threshold=1.0).masks(picture)) == 0
     silent = langsam(checkpoints, text_threshold=1.0)
     assert len(silent.masks(picture)) == 0
-    assert len(langsam(checkpoints, max_overlap=0.0).masks(picture)) <= len(model.masks(picture))
     assert silent.panoptic(picture).segments == ()
 
 
@@ -138,7 +149,7 @@ def test_langsam_without_words_is_refused_where_it_needs_them(
     assert len(model.grounded_masks(image(rng, 40, 50), ["chair"]).masks) > 0
     with pytest.raises(InputError, match="sam_model: expected one of sam, sam-hq, sam2, sam3, got"):
         LangSamOptions(sam_model="fast")
-    with pytest.raises(RangeError, match="box_threshold: expected 0 to 1"):
+    with pytest.raises(RangeError, match="box_threshold: expected a value in"):
         LangSamOptions(box_threshold=3)
     with pytest.raises(InputError, match="distinct words"):
         LangSamOptions(words=("a", "a"))
@@ -167,7 +178,6 @@ def test_the_second_weights_go_by_what_they_hold(checkpoints, tmp_path) -> None:
     assert model.settings["sam_weights"] == segmenter.settings["weights"]
     for name, value in (
         ("words", ("chair",)), ("box_threshold", 0.1), ("text_threshold", 0.1),
-        ("max_overlap", 0.5),
     ):  # fmt: skip
         assert langsam(checkpoints, **{name: value}).settings != model.settings
     assert langsam(checkpoints, sam="sam2").settings != model.settings
@@ -195,7 +205,8 @@ def test_second_weights_that_are_not_there(
 
 LOAD = """
 from splatseg.models import LoadOptions, find_model
-from splatseg.models.networks.langsam import LangSamOptions
+from splatseg.models.networks import grounding_dino
+from splatseg.models.networks.grounding_dino import LangSamOptions
 options = LangSamOptions(words=("chair",), sam_model="sam", sam_weights="tiny/sam")
 loading = LoadOptions(weights="tiny/detector", download=True, device="cpu")
 print(find_model("langsam", options, loading=loading, report=print).note)
@@ -235,7 +246,7 @@ def test_sam3_finds_what_its_network_finds(checkpoints, rng) -> None:
     from support.checkpoints_text import COLOURS
 
     mean, std = (torch.tensor(COLOURS[name]).view(3, 1, 1) for name in ("image_mean", "image_std"))
-    finder = model._finder
+    finder = model
     wanted: list[tuple[float, int, int]] = []
     for i, word in enumerate(WORDS):
         asked = finder._tokens._tokenizer(
@@ -262,7 +273,7 @@ def test_sam3_finds_what_its_network_finds(checkpoints, rng) -> None:
 def test_sam3_encodes_an_image_once(checkpoints, rng, monkeypatch) -> None:
     model = sam3(checkpoints)
     calls: list[int] = []
-    last = model._finder._last
+    last = model._seen
     run = last._run
     monkeypatch.setattr(last, "_run", lambda images: calls.append(len(images)) or run(images))
     picture = image(rng, 40, 50)
@@ -279,7 +290,7 @@ def test_sam3_thresholds_and_settings(checkpoints, rng) -> None:
     assert sum(m.area for m in sure.masks) < sum(m.area for m in model.masks(picture).masks)
     others = [{"words": ("chair",)}, {"threshold": 0.2}, {"mask_threshold": 0.2}]
     assert all(sam3(checkpoints, **one).settings != model.settings for one in others)
-    with pytest.raises(RangeError, match="mask_threshold: expected 0 to 1, got 2"):
+    with pytest.raises(RangeError, match="mask_threshold: expected a value in .*, got 2"):
         Sam3TextOptions(mask_threshold=2)
     with pytest.raises(RangeError, match="size: sam3 takes 112 alone, got 64"):
         sam3(checkpoints, size=64)
@@ -293,3 +304,82 @@ def test_sam3_thresholds_and_settings(checkpoints, rng) -> None:
 
 def test_sam3_as_it_is_published_holds_both(checkpoints, rng) -> None:
     assert len(sam3(checkpoints, "sam3_video").masks(image(rng, 40, 50))) > 0
+
+
+# CLIPSeg: the likeliest word of every pixel, held to the network's own logits.
+
+
+def made(checkpoints, *, size=None, batch=None, **options):
+    place = LoadOptions(weights=str(checkpoints("clipseg")), size=size, batch=batch, device="cpu")
+    return find_model("clipseg", ClipSegOptions(**{"words": WORDS} | options), loading=place)
+
+
+def own_logits(model, picture: torch.Tensor, sentence: str) -> torch.Tensor:
+    """Logits of one sentence by the library's whole network."""
+    mean, std = (torch.tensor(COLOURS[name]).view(3, 1, 1) for name in ("image_mean", "image_std"))
+    batch = ((picture.permute(2, 0, 1) / 255 - mean) / std)[None]
+    from transformers import AutoTokenizer
+
+    ids = AutoTokenizer.from_pretrained(model._place.folder)(sentence, return_tensors="pt")
+    with torch.inference_mode():
+        return model._network(pixel_values=batch, **ids).logits
+
+
+def test_every_pixel_has_its_likeliest_word(checkpoints, rng) -> None:
+    model = made(checkpoints, threshold=0.4)
+    assert isinstance(model, SemanticLabels)
+    picture = image(rng, 64, 64)
+    logits = torch.cat([own_logits(model, picture, f"a photo of a {word}") for word in WORDS])
+    probability, index = logits.sigmoid().max(dim=0)
+    wanted = torch.where(probability >= 0.4, index + 1, -1)
+    found = model.label_map(picture)
+    torch.testing.assert_close(found.confidence, probability, rtol=0, atol=1e-3)
+    assert float((found.ids == wanted).float().mean()) > 0.99, "all but ties"
+    assert set(found.ids.unique().tolist()) == {-1, 1, 2, 3}, "the test shows all of them"
+    assert [(row.id, row.name) for row in model.classes.rows] == list(enumerate(WORDS, start=1))
+
+
+def test_maps_have_the_size_of_the_photograph(checkpoints, rng) -> None:
+    picture = image(rng, 37, 90)
+    found = made(checkpoints, threshold=0.0).label_map(picture)
+    assert (found.height, found.width) == (37, 90)
+    assert int(found.ids.min()) >= 1, "at 0 every pixel has a word"
+    none = made(checkpoints, threshold=1.0).label_map(picture)
+    assert bool((none.ids == -1).all())
+    larger = made(checkpoints, threshold=0.0, size=96).label_map(picture)
+    assert not torch.equal(larger.ids, found.ids)
+
+
+def test_images_together_and_what_is_asked_count(checkpoints, rng) -> None:
+    model = made(checkpoints, batch=3)
+    assert model.batch_size == 3
+    pictures = [image(rng, 30, 40) for _ in range(3)]
+    alone = [model.label_map(one).confidence for one in pictures]
+    model.encode(pictures)
+    assert len(model._last._kept) == 3
+    for one, picture in zip(alone, pictures, strict=True):
+        torch.testing.assert_close(one, model.label_map(picture).confidence, rtol=0, atol=1e-4)
+    others = [
+        made(checkpoints, words=("chair",)),
+        made(checkpoints, threshold=0.5),
+        made(checkpoints, size=96),
+    ]
+    assert all(other.settings != model.settings for other in others)
+    assert model.settings["tokenizer"]
+
+
+def test_what_is_refused(checkpoints) -> None:
+    with pytest.raises(InputError, match="clipseg looks for what words name, so expected at least"):
+        made(checkpoints, words=())
+    with pytest.raises(RangeError, match="threshold: expected a value in .*, got 1.5"):
+        ClipSegOptions(threshold=1.5)
+    with pytest.raises(InputError, match="template: this option was removed; words stand in"):
+        ClipSegOptions(template="a photo")
+    with pytest.raises(RangeError, match="size: expected a multiple of 16, got 100"):
+        made(checkpoints, size=100)
+    with pytest.raises(FileFormatError, match=r"expected weights of clipseg, got those of 'clip'"):
+        find_model(
+            "clipseg",
+            ClipSegOptions(words=WORDS),
+            loading=LoadOptions(weights=str(checkpoints("clip"))),
+        )

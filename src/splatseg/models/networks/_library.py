@@ -4,25 +4,34 @@ import copy
 import functools
 import importlib
 import sys
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, cast
+from types import MappingProxyType
+from typing import Any, ClassVar, Generic, Literal, TypeVar, cast
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
-from splatseg.core.models import Model
+from splatseg.core.models import Image
 from splatseg.errors import (
     FileFormatError,
     MissingPackageError,
+    RangeError,
     SplatsegError,
     quoted,
     reason,
 )
-from splatseg.models._encoded import is_lack_of_memory
-from splatseg.models._family import Checkpoint, Loading, ModelFamily
-from splatseg.models._sources import What
-from splatseg.models._weights import weight_files
+from splatseg.models._images import (
+    Frame,
+    LastImages,
+    Normalisation,
+    is_lack_of_memory,
+    network_input,
+)
+from splatseg.models._weights import Loading, weight_files
 from splatseg.models.networks._config import (
     checked_config,
     library_config,
@@ -61,15 +70,7 @@ def library() -> Any:
 
 
 def configuration(place: Loading, kinds: Sequence[str]) -> dict[str, Any]:
-    """What the weights' config.json says, of one of these kinds; see `checked_config`.
-
-    Args:
-        place: The weights.
-        kinds: Values of ``model_type`` that are taken.
-
-    Raises:
-        FileFormatError: If the weights are of another network, or their file says what none may.
-    """
+    """What the weights' config.json says, of one of these values of ``model_type``."""
     library()
     return checked_config(place.folder / "config.json", tuple(kinds))
 
@@ -166,15 +167,7 @@ def _check_size(
 
 
 def side_of(folder: Path, value: object) -> int:
-    """A side in pixels of what a network takes, or of its patches, out of its configuration.
-
-    Args:
-        folder: The weights.
-        value: One number, or those of rows and columns, of which the larger counts.
-
-    Raises:
-        FileFormatError: If it is none above 0.
-    """
+    """A side in pixels, or the larger of two, out of the configuration of weights in a folder."""
     sides = cast("Sequence[object]", value) if isinstance(value, list | tuple) else [value]
     whole = [side for side in sides if isinstance(side, int) and side > 0]
     if not whole or len(whole) < len(sides):
@@ -184,52 +177,99 @@ def side_of(folder: Path, value: object) -> int:
     return max(whole)
 
 
-def network_family(
-    name: str,
-    summary: str,
-    *checkpoints: Checkpoint,
-    reference: str,
-    gives: tuple[What, ...],
-    options: type[Any],
-    make: Callable[[str, Any, Loading], Model],
-) -> ModelFamily:
-    """A family of networks of this library.
+class NetworkModel:
+    """What adapters of networks have in common: name, note and settings.
 
     Args:
-        name: As it is asked for.
-        summary: One line.
-        checkpoints: Published weights, the default first.
-        reference: The paper.
-        gives: What such a model can be asked for.
-        options: Dataclass of its options.
-        make: Makes the model of the family's name, options and weights.
+        name: Name of the family.
+        options: Its options.
+        place: The weights, and where the network runs.
     """
-    return ModelFamily(
-        name=name,
-        summary=summary,
-        reference=reference,
-        gives=gives,
-        options=options,
-        load=lambda chosen, place: make(name, chosen, cast(Loading, place)),
-        checkpoints=checkpoints,
-        packages=("transformers",),
-    )
+
+    _unrecorded: ClassVar[tuple[str, ...]] = ()
+    """Names of options that change no answer."""
+
+    _constants: ClassVar[Mapping[str, Any]] = {}
+    """Settings that were options once. They are recorded, so that work of then can go on."""
+
+    _normalisation: Normalisation
+    _input_size: int = 0
+    """Side of the input, pixels, as it is recorded; 0 where the weights say it of each image."""
+
+    _more_settings: Mapping[str, Any] = MappingProxyType({})
+    """What else changes the answers, such as the tokenizer's digest."""
+
+    def __init__(self, name: str, options: Any, place: Loading) -> None:
+        self.name = name
+        self.note = f"weights {place.name}"
+        self._options = options
+        self._place = place
+
+    @property
+    def settings(self) -> Mapping[str, Any]:
+        """Options, weights, precision and size of the input."""
+        return self.settings_of(self._options)
+
+    @property
+    def default_settings(self) -> Mapping[str, Any]:
+        """The same with default options."""
+        return self.settings_of(type(self._options)())
+
+    def settings_of(self, options: Any) -> Mapping[str, Any]:
+        """What changes the answers, with other options."""
+        chosen = {
+            name: value for name, value in asdict(options).items() if name not in self._unrecorded
+        }
+        return {
+            **self._constants,
+            **chosen,
+            "weights": self._place.digest,
+            "dtype": str(self._place.dtype).removeprefix("torch."),
+            "size": self._input_size,
+            **self._more_settings,
+        }
+
+    def _check_size(self, size: int) -> None:
+        """Refuse another size than the only one that a network takes."""
+        if self._place.size not in (None, size):
+            raise RangeError(
+                f"size: {self._place.name} takes {size} alone, got {self._place.size}."
+            )
+
+    def _input(
+        self,
+        images: Sequence[Image],
+        frame: Frame,
+        *,
+        mode: Literal["bilinear", "bicubic"] = "bilinear",
+        padding: Literal["mean", "black"] = "mean",
+    ) -> Float[Tensor, "images 3 height width"]:
+        """`network_input`, where the network runs and in its precision."""
+        place = self._place
+        return network_input(
+            images, frame, self._normalisation,
+            device=place.device, dtype=place.dtype, mode=mode, padding=padding,
+        )  # fmt: skip
 
 
-def settings_of(
-    options: Any, place: Loading, *, size: int, unrecorded: Sequence[str] = ()
-) -> dict[str, Any]:
-    """What changes a network's answers: its options, weights, precision and size of the input.
+_A = TypeVar("_A")
 
-    Args:
-        options: The dataclass of its options.
-        place: The weights.
-        size: Side of the input, pixels.
-        unrecorded: Names of options that change no answer.
-    """
-    chosen = {name: value for name, value in asdict(options).items() if name not in unrecorded}
-    return chosen | {
-        "weights": place.digest,
-        "dtype": str(place.dtype).removeprefix("torch."),
-        "size": size,
-    }
+
+class BatchedNetwork(NetworkModel, ABC, Generic[_A]):
+    """A network that sees several images at once, and keeps what it made of the last ones."""
+
+    _resizable: ClassVar[bool] = True
+    """Whether it takes inputs of another size."""
+
+    def __init__(self, name: str, options: Any, place: Loading) -> None:
+        super().__init__(name, options, place)
+        self.batch_size = place.images_together
+        self._last = LastImages[_A](self._encode, resizable=self._resizable)
+
+    def encode(self, images: Sequence[Image]) -> None:
+        """Pass images of one size through the network at once."""
+        self._last.encode(images)
+
+    @abstractmethod
+    def _encode(self, images: Sequence[Image]) -> Sequence[_A]:
+        """What the network makes of images of one size."""

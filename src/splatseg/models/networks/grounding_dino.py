@@ -1,25 +1,29 @@
-"""Grounding DINO: boxes of what words mean; in its first form and that of MMDetection.
+"""Grounding DINO: boxes of what words mean; with Segment Anything after it, their masks.
 
-Liu et al. 2023 (arXiv:2303.05499), Zhao et al. 2024 (arXiv:2401.02361).
+Liu et al. 2023 (arXiv:2303.05499); MMDetection's form of it, Zhao et al. 2024 (arXiv:2401.02361).
+The pair is known as Grounded SAM, Ren et al. 2024 (arXiv:2401.14159), and as LangSAM.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, ClassVar, Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from typing_extensions import override
 
-from splatseg.core.boundary import convert_fields
-from splatseg.core.models import Boxes, Image
-from splatseg.errors import InputError, RangeError
-from splatseg.models._family import Checkpoint, Loading
-from splatseg.models._images import Frame, Normalisation, frame_of, input_side, network_input
-from splatseg.models._mask_generator import Candidates, distinct
-from splatseg.models._words import checked_words
-from splatseg.models.networks._library import configuration, network, network_family, settings_of
-from splatseg.models.networks._tokens import Tokens
+from splatseg.core import Rle
+from splatseg.core.models import Boxes, Image, Prompt, TextMasks
+from splatseg.core.options import Share, options
+from splatseg.errors import InputError
+from splatseg.models._images import Frame, Normalisation, frame_of, input_side
+from splatseg.models._mask_generator import distinct
+from splatseg.models._registry import own_family
+from splatseg.models._weights import Loading, second_loading
+from splatseg.models.networks._library import NetworkModel, configuration, network
+from splatseg.models.networks._words import Tokens, checked_words
+from splatseg.models.networks.sam import Sam, SamOptions
+from splatseg.models.networks.word_masks import WordMasks, text_masks
 
 _CLASSES = {
     "grounding-dino": "GroundingDinoForObjectDetection",
@@ -34,59 +38,39 @@ _SEPARATORS = ".?"
 """What the network takes for the end of a phrase."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+MAX_OVERLAP = 0.8
+"""Boxes of one word that overlap more, as IoU, are of one thing; the surest is kept."""
+
+
+@options(removed={"max_overlap": f"boxes of one word are held apart at an IoU of {MAX_OVERLAP}"})
 class GroundingDinoOptions:
     """When a box counts as found, and for which word."""
 
-    box_threshold: float = 0.35
+    box_threshold: Share = 0.35
     """Least probability, in [0, 1], of the token that a box fits best, out of those of its word."""
 
-    text_threshold: float = 0.25
+    text_threshold: Share = 0.25
     """Least probability, in [0, 1], of a token that speaks for its word."""
 
-    max_overlap: float = 0.8
-    """Boxes of one word that overlap more, as IoU in [0, 1], are of one thing; the surest is
-    kept."""
 
-    def __post_init__(self) -> None:
-        convert_fields(self)
-        for name in ("box_threshold", "text_threshold", "max_overlap"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise RangeError(f"{name}: expected 0 to 1, got {getattr(self, name)}.")
-
-
-class GroundingDino:
+class GroundingDino(NetworkModel):
     """Boxes of what words mean, all words in one pass."""
 
+    _constants: ClassVar = {"max_overlap": MAX_OVERLAP}
+    _unrecorded: ClassVar = ("sam_weights",)
+
     def __init__(self, name: str, options: GroundingDinoOptions, place: Loading) -> None:
+        super().__init__(name, options, place)
         content = configuration(place, tuple(_CLASSES))
-        self.name = name
-        self.note = f"weights {place.name}"
-        self._options = options
-        self._place = place
         self._network = network(place, _CLASSES[str(content["model_type"])], content)
         config = self._network.config
         longest = min(int(config.max_text_len), int(config.text_config.max_position_embeddings))
         self._tokens = Tokens(place, config, longest=longest)
+        self._more_settings = {"tokenizer": self._tokens.digest}
         self._shortest = input_side(place.folder, "shortest_edge", _SHORTEST)
         self._longest = input_side(place.folder, "longest_edge", _LONGEST)
+        self._input_size = place.size or self._longest
         self._normalisation = Normalisation.of(place.folder)
-
-    @property
-    def settings(self) -> Mapping[str, Any]:
-        """Options, weights, tokenizer, precision and longer side of the input."""
-        return self.settings_with(self._options)
-
-    @property
-    def default_settings(self) -> Mapping[str, Any]:
-        """The same with default options."""
-        return self.settings_with(GroundingDinoOptions())
-
-    def settings_with(self, options: Any, *, unrecorded: Sequence[str] = ()) -> Mapping[str, Any]:
-        """What changes the answers, with other options."""
-        size = self._place.size or self._longest
-        found = settings_of(options, self._place, size=size, unrecorded=unrecorded)
-        return found | {"tokenizer": self._tokens.digest}
 
     def boxes(self, image: Image, words: Sequence[str]) -> Boxes:
         """Boxes of what the words mean, the surest first.
@@ -106,14 +90,9 @@ class GroundingDino:
         text, places = phrases(words)
         tokens = word_tokens(self._tokens.spans(text), places)
         asked = self._tokens.of([text] * len(images))
-        batch = network_input(
-            images,
-            self._frame(height, width),
-            self._normalisation,
-            device=self._place.device,
-            dtype=self._place.dtype,
+        output = self._network(
+            pixel_values=self._input(images, self._frame(height, width)), **asked
         )
-        output = self._network(pixel_values=batch, **asked)
         return [
             found_boxes(
                 logits.float().sigmoid().cpu(),
@@ -201,7 +180,7 @@ def found_boxes(
     keep = (most > 0) & (score >= options.box_threshold)
     keep &= (corners[:, 2:] > corners[:, :2]).all(dim=1)
     corners, score, word = corners[keep], score[keep], word[keep]
-    order = _one_a_thing(corners, score, word, options.max_overlap)
+    order = _one_a_thing(corners, score, word)
     return Boxes(
         boxes=corners[order] * torch.tensor([width, height, width, height]),
         scores=score[order],
@@ -209,17 +188,12 @@ def found_boxes(
     )
 
 
-def _one_a_thing(
-    corners: Float[Tensor, "n 4"], score: Float[Tensor, "n"], word: Tensor, max_overlap: float
-) -> Tensor:
+def _one_a_thing(corners: Float[Tensor, "n 4"], score: Float[Tensor, "n"], word: Tensor) -> Tensor:
     """Indices of boxes, the surest first, without those that a surer box of their word covers."""
     kept: list[Tensor] = []
     for one in word.unique():
         of_word = (word == one).nonzero()[:, 0]
-        found = Candidates(
-            logits=corners[of_word, None], scores=score[of_word], boxes=corners[of_word]
-        )
-        kept.append(of_word[distinct(found, max_overlap)])
+        kept.append(of_word[distinct(corners[of_word], score[of_word], MAX_OVERLAP)])
     index = torch.cat(kept).sort().values if kept else torch.zeros(0, dtype=torch.int64)
     return index[torch.sort(score[index], descending=True, stable=True).indices]
 
@@ -228,18 +202,56 @@ def _no_boxes() -> Boxes:
     return Boxes(boxes=torch.zeros(0, 4), scores=torch.zeros(0), words=())
 
 
-GROUNDING_DINO = network_family(
-    "grounding-dino",
-    "boxes of what words mean, for other steps; langsam makes masks of them",
-    Checkpoint(id="IDEA-Research/grounding-dino-tiny", megabytes=690, licence="Apache-2.0"),
-    Checkpoint(id="IDEA-Research/grounding-dino-base", megabytes=933, licence="Apache-2.0"),
-    Checkpoint(
-        id="openmmlab-community/mm_grounding_dino_tiny_o365v1_goldg_v3det",
-        megabytes=690,
-        licence="Apache-2.0",
-    ),
-    reference="arXiv:2303.05499",
-    gives=(),
-    options=GroundingDinoOptions,
-    make=GroundingDino,
-)
+@options
+class LangSamOptions(GroundingDinoOptions):
+    """Which words are looked for, when a box counts as found, and which SAM makes its mask."""
+
+    words: tuple[str, ...] = ()
+    """Words or phrases that are looked for, all in one pass."""
+
+    sam_model: Literal["sam", "sam-hq", "sam2", "sam3"] = "sam2"
+    """Model that makes masks of the boxes."""
+
+    sam_weights: str | None = None
+    """Folder or id of that model's weights, as --weights has those of Grounding DINO. None takes
+    its default; `see --model NAME --help` names it."""
+
+    def __post_init__(self) -> None:
+        checked_words(self.words)
+
+
+class LangSam(WordMasks):
+    """Masks of what words mean: boxes by Grounding DINO, their masks by SAM."""
+
+    def __init__(self, name: str, options: LangSamOptions, place: Loading) -> None:
+        super().__init__(name, options, place)
+        self._detector = GroundingDino(name, options, place)
+        family = own_family(options.sam_model)
+        second = second_loading(family, options.sam_weights, place, flag="--sam-weights")
+        self._segmenter = Sam(family.name, SamOptions(), second)
+
+    @override
+    def settings_of(self, options: Any) -> dict[str, Any]:
+        """Both networks: weights go by their digest, wherever they lie."""
+        other = {f"sam_{name}": self._segmenter.settings[name] for name in ("weights", "size")}
+        return {**self._detector.settings_of(options), **other}
+
+    @override
+    def _find(self, images: Sequence[Image], words: Sequence[str]) -> list[TextMasks]:
+        boxes = self._detector.boxes_of(images, words)
+        shown = [image for image, one in zip(images, boxes, strict=True) if one.words]
+        if shown:
+            self._segmenter.encode(shown)
+        return [self._masks_of(image, one) for image, one in zip(images, boxes, strict=True)]
+
+    def _masks_of(self, image: Image, boxes: Boxes) -> TextMasks:
+        """The mask of each box, with the score of the box: SAM's own is not of the word."""
+        masks: list[Rle] = []
+        if boxes.words:
+            embedding = self._segmenter.embed(image)
+            masks = [
+                self._segmenter.prompted_masks(embedding, Prompt(box=box)).masks[0]
+                for box in boxes.boxes
+            ]
+        size = int(image.shape[0]), int(image.shape[1])
+        return text_masks(masks, boxes.scores.tolist(), boxes.words, size)

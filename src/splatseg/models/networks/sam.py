@@ -4,29 +4,31 @@ Kirillov et al. 2023 (arXiv:2304.02643), Ke et al. 2023 (arXiv:2306.01567), Ravi
 (arXiv:2408.00714), Carion et al. 2025 (arXiv:2511.16719).
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, Literal, cast
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal, cast
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
+from typing_extensions import override
 
 from splatseg.core import FeatureMap, MaskSet, Rle
-from splatseg.core.boundary import convert_fields
 from splatseg.core.models import DeepFeatures, Embedding, Image, Prompt
-from splatseg.errors import RangeError
-from splatseg.models._encoded import LastImages
-from splatseg.models._family import Checkpoint, Loading
-from splatseg.models._images import HALVES, Frame, Normalisation, frame_of, network_input
-from splatseg.models._mask_generator import Decode, MaskGeneratorOptions, automatic_masks
+from splatseg.models._images import HALVES, Frame, Normalisation, frame_of
+from splatseg.models._mask_generator import (
+    STABILITY_OFFSET,
+    Decode,
+    SamOptions,
+    automatic_masks,
+)
+from splatseg.models._weights import Loading
 from splatseg.models.networks._library import (
+    BatchedNetwork,
     answering,
     configuration,
     network,
-    network_family,
-    settings_of,
     side_of,
 )
 
@@ -68,16 +70,14 @@ _SAM3_PARTS = {
 """The tracker's tensors in weights that hold the detector too. The library takes one
 "tracker_model." off by itself, and puts two before the names where it writes such weights."""
 
+_EMBEDDING = -1
+"""The coarsest map, the last one: 256 channels on 64 x 64 cells at full size."""
+
+_SURE = 10.0
+"""Logit of a pixel that a rough mask holds."""
+
 _CUT = 0.0
 """Logit above which a pixel is in the mask."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SamOptions(MaskGeneratorOptions):
-    """Which masks are kept when nobody prompts; the defaults are the published ones."""
-
-    multimask: bool = field(default=True)
-    """Three masks a point, for part, object and group, instead of one."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -89,44 +89,25 @@ class _Seen:
     """Embedding and whatever else the decoder needs, each (1, channels, rows, columns) or so."""
 
 
-class Sam:
+class Sam(BatchedNetwork[_Seen]):
     """Masks of things, by points, boxes and rough masks, or of a grid of points."""
 
+    _resizable = False
+    _constants: ClassVar = {"multimask": True, "stability_offset": STABILITY_OFFSET}
+
     def __init__(self, name: str, options: SamOptions, place: Loading) -> None:
-        convert_fields(options)
+        super().__init__(name, options, place)
         content = configuration(place, _TYPES[name])
         held = str(content["model_type"])
         kind = held.replace("sam2_video", "sam2").replace("sam3_video", "sam3_tracker")
         parts: dict[str, Any] = {"key_mapping": _SAM3_PARTS} if held == "sam3_video" else {}
-        self.name = name
-        self.note = f"weights {place.name}"
-        self.batch_size = place.images_together
         self._kind = _KINDS[kind]
-        self._options = options
-        self._place = place
         self._network = network(place, self._kind.class_name, content, **parts)
-        self._size = self._trained_size()
-        if place.size not in (None, self._size):
-            raise RangeError(f"size: {place.name} takes {self._size} alone, got {place.size}.")
+        vision = self._network.config.vision_config
+        size = getattr(getattr(vision, "backbone_config", vision), "image_size", None)
+        self._input_size = side_of(place.folder, size or self._kind.default_size)
+        self._check_size(self._input_size)
         self._normalisation = Normalisation.of(place.folder, self._kind.colours)
-        self._last = LastImages[_Seen](self._encode, resizable=False)
-
-    @property
-    def settings(self) -> Mapping[str, Any]:
-        """Options, weights, precision and size of the input."""
-        return self._settings(self._options)
-
-    @property
-    def default_settings(self) -> Mapping[str, Any]:
-        """The same with default options."""
-        return self._settings(SamOptions())
-
-    def _settings(self, options: SamOptions) -> Mapping[str, Any]:
-        return settings_of(options, self._place, size=self._size, unrecorded=("prompts_per_batch",))
-
-    def encode(self, images: Sequence[Image]) -> None:
-        """Pass images of one size through the encoder at once."""
-        self._last.encode(images)
 
     def masks(self, image: Image) -> MaskSet:
         """Masks for a grid of points: `automatic_masks`."""
@@ -184,7 +165,7 @@ class Sam:
             positive=prompt.signs[None],
             box=None if prompt.box is None else prompt.box[None],
             mask=None if prompt.mask is None else prompt.mask[None],
-            multimask=self._options.multimask and vague,
+            multimask=vague,
         )
         order = torch.sort(scores[0], descending=True, stable=True).indices
         size = (embedding.height, embedding.width)
@@ -205,27 +186,19 @@ class Sam:
                 seen,
                 points=points[:, None],
                 positive=torch.ones(len(points), 1, dtype=torch.bool),
-                multimask=self._options.multimask,
+                multimask=True,
             )
 
         return decode
 
-    def _trained_size(self) -> int:
-        """Side of the input that the weights were made for, pixels."""
-        vision = self._network.config.vision_config
-        size = getattr(getattr(vision, "backbone_config", vision), "image_size", None)
-        return side_of(self._place.folder, size or self._kind.default_size)
-
     def _frame(self, height: int, width: int) -> Frame:
-        return frame_of(height, width, size=self._size, shape=self._kind.shape)
+        return frame_of(height, width, size=self._input_size, shape=self._kind.shape)
 
+    @override
     @torch.inference_mode()
     def _encode(self, images: Sequence[Image]) -> list[_Seen]:
         frame = self._frame(*(int(side) for side in images[0].shape[:2]))
-        batch = network_input(
-            images, frame, self._normalisation, device=self._place.device, dtype=self._place.dtype
-        )
-        maps = answering(self._place.folder, self._maps)(batch)
+        maps = answering(self._place.folder, self._maps)(self._input(images, frame))
         return [
             _Seen(frame=frame, maps=tuple(one[i : i + 1] for one in maps))
             for i in range(len(images))
@@ -301,13 +274,6 @@ class Sam:
         return (small - 0.5) * 2 * _SURE
 
 
-_EMBEDDING = -1
-"""The coarsest map, the last one: 256 channels on 64 x 64 cells at full size."""
-
-_SURE = 10.0
-"""Logit of a pixel that a rough mask holds."""
-
-
 def _flat(found: Any) -> list[Tensor]:
     """Embeddings as the networks give them, the one of the whole image last."""
     if isinstance(found, Tensor):
@@ -316,47 +282,3 @@ def _flat(found: Any) -> list[Tensor]:
     if len(items) == 2 and not isinstance(items[1], Tensor):  # SAM-HQ: embedding, then blocks
         return [*cast("Sequence[Tensor]", items[1]), items[0]]
     return cast("list[Tensor]", items)
-
-
-SAM = network_family(
-    "sam",
-    "Segment Anything of 2023: masks of parts, objects and groups, and its embedding",
-    Checkpoint(id="facebook/sam-vit-base", megabytes=375, licence="Apache-2.0"),
-    Checkpoint(id="facebook/sam-vit-large", megabytes=1250, licence="Apache-2.0"),
-    Checkpoint(id="facebook/sam-vit-huge", megabytes=2565, licence="Apache-2.0"),
-    reference="arXiv:2304.02643",
-    gives=("masks", "features"),
-    options=SamOptions,
-    make=Sam,
-)
-SAM_HQ = network_family(
-    "sam-hq",
-    "Segment Anything with finer borders",
-    Checkpoint(id="syscv-community/sam-hq-vit-base", megabytes=379, licence="Apache-2.0"),
-    reference="arXiv:2306.01567",
-    gives=("masks", "features"),
-    options=SamOptions,
-    make=Sam,
-)
-SAM2 = network_family(
-    "sam2",
-    "Segment Anything 2: masks, faster than the first",
-    Checkpoint(id="facebook/sam2.1-hiera-small", megabytes=184, licence="Apache-2.0"),
-    Checkpoint(id="facebook/sam2.1-hiera-base-plus", megabytes=324, licence="Apache-2.0"),
-    Checkpoint(id="facebook/sam2.1-hiera-large", megabytes=898, licence="Apache-2.0"),
-    reference="arXiv:2408.00714",
-    gives=("masks", "features"),
-    options=SamOptions,
-    make=Sam,
-)
-SAM3 = network_family(
-    "sam3",
-    "Segment Anything 3: its tracker's masks for points and boxes",
-    Checkpoint(
-        id="facebook/sam3", megabytes=3440, licence="SAM License", note="access must be asked for"
-    ),
-    reference="arXiv:2511.16719",
-    gives=("masks", "features"),
-    options=SamOptions,
-    make=Sam,
-)
