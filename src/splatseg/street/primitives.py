@@ -19,7 +19,7 @@ from splatseg._check import check_choice, check_finite, check_range, check_shape
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError, RangeError
-from splatseg.lift.points.thin import thin
+from splatseg.lift.point_shapes import thin
 from splatseg.street.mesh import PrimitiveMesh
 from splatseg.street.shapes import ShapeAutoEncoder, primitive_scale, sphere_code
 from splatseg.street.shapes.template import VERTICES

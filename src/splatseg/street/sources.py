@@ -9,7 +9,7 @@ from torch import Tensor
 from splatseg.core import Gaussians, ScanSource
 from splatseg.core.boundary import boundary
 from splatseg.errors import RangeError
-from splatseg.lift.points.thin import thin
+from splatseg.lift.point_shapes import thin
 from splatseg.street.geometry import DepthView
 
 _MIN_OPACITY = 0.5

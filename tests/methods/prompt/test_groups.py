@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from splatseg.core import MaskSet, View
-from splatseg.lift.words import ThingLooks, WordAnswers
+from splatseg.lift.phrases import ThingLooks
+from splatseg.lift.words import WordAnswers
 from splatseg.methods.prompt._groups import answering, mask_groups
 from splatseg.methods.prompt._table import MaskTable
 from support.red_square import SIZE, camera

@@ -8,7 +8,6 @@ from splatseg._check import check_choice, check_range
 from splatseg.core.boundary import convert_fields
 from splatseg.core.typed_text import REPEATED
 from splatseg.errors import InputError, RangeError
-from splatseg.lift.words import AnswerOptions
 
 InitialViews = Literal["kmeans", "random", "single"]
 Region = Literal["masks", "cells"]
@@ -124,9 +123,6 @@ class PromptOptions:
     threshold: float | None = None
     """Tau: the share in [0, 1] that a Gaussian must exceed. None is 0.3 with transposed votes,
     0.35 with visible ones, and published 0.6 with words and 0.7 with points by hand."""
-
-    answers: AnswerOptions = field(default_factory=AnswerOptions)
-    """How cosines become probabilities."""
 
     def __post_init__(self) -> None:
         convert_fields(self)

@@ -11,7 +11,7 @@ over all of its pixels,
 for mask l of view v: what only one of the views sees counts for neither.
 
 Features of masks are solved for together over the cells of all initial views, with the masks
-painted over each other, the smallest last (`lift.words.unmixing`).
+painted over each other, the smallest last (`methods.objects`).
 """
 
 from collections.abc import Sequence
@@ -30,14 +30,11 @@ from splatseg.errors import InputError
 from splatseg.io.evidence import Evidence
 from splatseg.lift.mass.features import checked_grid
 from splatseg.lift.mass.segment_masses import ViewMasses, view_masses
-from splatseg.lift.words import ThingLooks, thing_looks
-from splatseg.lift.words.object_features import BLURS, cell_shares
-from splatseg.lift.words.unmixing import NormalEquations, blurred
+from splatseg.lift.phrases import ThingLooks, thing_looks
+from splatseg.methods.objects import MixingModel
 
 _MIN_PIXELS = 16
 """Masks with fewer are no candidates."""
-
-_RIDGE = 1.0
 
 _MOSTLY = 0.5
 """Share of what a view sees of a Gaussian from which on it is of a mask."""
@@ -202,14 +199,10 @@ def _unmixed(
     rest: int,
 ) -> NDArray[np.float64]:
     """Features of all painted masks and, behind them, of what no mask has."""
-    systems = [NormalEquations(rest + 1, grids[0].channels) for _ in BLURS]
+    model = MixingModel(rest + 1, grids[0].channels)
     for at, (grid, found) in enumerate(zip(grids, maps, strict=True)):
-        columns, shares = cell_shares(np.where(found < 0, rest, found + starts[at]), grid)
-        features = grid.features.double().cpu().flatten(0, 1).numpy()
-        for blur, system in zip(BLURS, systems, strict=True):
-            system.add(columns, blurred(shares, blur), features)
-    solved = [system.solved(_RIDGE) for system in systems]
-    return min(solved, key=lambda one: one[1])[0]
+        model.add(np.where(found < 0, rest, found + starts[at]), grid)
+    return model.solved()[0]
 
 
 def mask_overlaps(

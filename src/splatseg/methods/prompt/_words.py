@@ -27,15 +27,10 @@ from splatseg.core.models import GroundedMasks, Image
 from splatseg.errors import InputError
 from splatseg.lift.mass.features import checked_grid
 from splatseg.lift.mass.segment_masses import view_masses
+from splatseg.lift.phrases import answer_phrases
 from splatseg.lift.relevancy import relevancy
 from splatseg.lift.vocabulary import Vocabulary
-from splatseg.lift.words import (
-    WordAnswers,
-    answer_phrases,
-    answer_words,
-    context_of,
-    word_span,
-)
+from splatseg.lift.words import TEMPERATURE, WordAnswers, answer_words, context_of, word_span
 from splatseg.methods.prompt._groups import (
     FoundObject,
     MaskGroups,
@@ -85,15 +80,13 @@ class MaskAnswers:
         answers = self._asked(word)
         looks = self._table.looks
         if self._options.phrases == "parts" and looks is not None:
-            tau = self._options.answers.temperature
             scores, probabilities = answer_phrases(
                 answers,
                 lambda: looks,
                 self._vocabulary,
                 lambda part: self._asked(part).probabilities[:, 0],
-                temperature=tau,
             )
-            answers = replace(answers, cosines=scores / tau, probabilities=probabilities)
+            answers = replace(answers, cosines=scores / TEMPERATURE, probabilities=probabilities)
         return answering(
             self._table,
             self._groups,
@@ -109,7 +102,6 @@ class MaskAnswers:
             [word],
             self._vocabulary,
             self._span,
-            options=self._options.answers,
         )
 
 

@@ -7,8 +7,8 @@ from splatseg.core.models import TextFeatures
 from splatseg.errors import InputError
 from splatseg.io.evidence import FeatureEvidence, open_evidence
 from splatseg.lift.vocabulary import Vocabulary, vocabulary_of
-from splatseg.lift.voxels import VoxelWords
 from splatseg.lift.words import WordIndex
+from splatseg.methods.voxels.words import VoxelWords
 from splatseg.tasks.benchmark.job import Job
 from splatseg.tasks.benchmark.sight import Seen
 

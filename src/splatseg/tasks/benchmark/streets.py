@@ -37,7 +37,7 @@ from splatseg.io.evidence import open_evidence
 from splatseg.io.npz_writing import save_arrays
 from splatseg.io.paths import path_inside
 from splatseg.lift import GaussianField
-from splatseg.lift.points import RegionOptions, region_labels
+from splatseg.lift.point_regions import region_labels
 from splatseg.methods import Method
 from splatseg.street.build import METHOD_NAME
 from splatseg.street.field import MeshField
@@ -263,7 +263,7 @@ class Drive:
             labels.ids,
             points,
             weights=_seen_weights(labels) if rule == "fair" else None,
-            options=RegionOptions(radius=self._switches.radius / unit),
+            radius=self._switches.radius / unit,
         )
 
     @cached_property

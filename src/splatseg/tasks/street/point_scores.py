@@ -19,7 +19,7 @@ from splatseg.core.boundary import boundary
 from splatseg.evaluate import Confusion, semantic_score
 from splatseg.evaluate.protocols import street_class
 from splatseg.io.depths import depth_kind
-from splatseg.lift.points import points_in_sight
+from splatseg.lift.viewed_points import points_in_sight
 from splatseg.report.street_report import PointScore
 from splatseg.street.geometry import DepthView, capture_views, field_views
 

@@ -1,25 +1,33 @@
-r"""Points that take labels from what views of a field show at them, and from their own shapes.
+r"""Labels of points of the world from what views of a field show at them, and from their shapes.
 
-1. Points are thinned to cells (`thin`); each cell is labelled once.
-2. Views of the field vote where their depth says that they see a cell (`votes`).
-3. Cells that views saw teach a forest what shapes are called (`forest`, `shapes`), and it tells
-   its mind of all, above all of those that no view sees: a laser looks all around, cameras ahead.
+1. Points are thinned to cells (`point_shapes.thin`); each cell is labelled once.
+2. Views vote at the points x that they show, with the label c of the pixel that x projects to:
+
+   .. math:: v_c(x) = \sum_{j:\; z_j(x) \le (1 + \rho)\, D_j(x) + \tau}
+                      \min\!\left(1, \frac{r}{z_j(x)}\right) [L_j(x) = c]
+
+   with z the z-depth of the point in view j, D the median depth of what the field shows in its
+   pixel and L its label map there. What lies before the surface is seen, so that a surface that the
+   field has too far away loses no points; what lies behind it by more than the tolerance is not.
+   Far views, whose pixels cover more of the world, count less.
+3. Cells that views saw teach a forest what shapes are called (`point_shapes`), and it answers for
+   all, also for those that no view sees: a laser looks all around, cameras ahead.
 4. Both are one table, :math:`y = (v + \lambda f) / (\sum_c v_c + \lambda)`, smoothed along
-   surfaces (`smooth`).
+   surfaces.
 
 Any `splatseg.core.Renderable` can be asked, Gaussians or surfaces: it shows label maps and depths.
 """
 
 import math
 from collections import OrderedDict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int, Int64
 from torch import Tensor
 
-from splatseg._check import check_finite, check_range, check_shape
+from splatseg._check import check_finite, check_shape
 from splatseg.core import (
     UNLABELLED,
     Camera,
@@ -29,91 +37,205 @@ from splatseg.core import (
     RenderableView,
     ScanSource,
 )
-from splatseg.core.boundary import boundary, convert_fields
+from splatseg.core.boundary import boundary
+from splatseg.core.options import Count, Natural, Positive, options
 from splatseg.errors import InputError, RangeError
-from splatseg.lift.points.forest import ShapeForest, ShapeSamples, drawn
-from splatseg.lift.points.shapes import Surroundings, surroundings
-from splatseg.lift.points.smooth import smoothed
-from splatseg.lift.points.thin import Thinned, thin
-from splatseg.lift.points.votes import SeenView, view_votes
+from splatseg.lift.point_shapes import (
+    LocalShapes,
+    ShapeForest,
+    ShapeSamples,
+    Thinned,
+    drawn,
+    local_shapes,
+    smoothed,
+    thin,
+)
 
-_POSITIVE = ("cell", "full_distance", "smoothing_width", "normal_width")
-_NOT_NEGATIVE = ("tolerance", "relative_tolerance", "shape_votes")
-_AT_LEAST_ONE = ("trees", "samples", "memory", "window")
+VOTE_TOLERANCE = 0.3
+"""Tau of votes, metres."""
+
+RELATIVE_TOLERANCE = 0.03
+"""Rho: the depth of a pixel is that of its centre, and far ones cover more."""
+
+FULL_DISTANCE = 10.0
+"""R, metres: views up to here have a full vote at a point."""
+
+SHAPE_VOTES = 2.0
+"""Lambda: how many votes of views the word of shapes is worth."""
+
+TREES = 40
+SAMPLES = 10_000
+"""Cells of each label that they learn from, at most."""
+
+OVERLAP = 8
+"""Scans on either side of a window that are looked at with it."""
+
+SIGHT_TOLERANCE = 0.1
+"""Tau of `points_in_sight`, metres: noise of a laser, and of depth maps."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SeenPoints:
+    """Points that a view saw, ascending, and where."""
+
+    points: Int64[Tensor, "m"]
+    columns: Int64[Tensor, "m"]
+    rows: Int64[Tensor, "m"]
+    depth: Float[Tensor, "m"]
+    """Their z-depth, float64."""
+
+
+def seen_points(
+    points: Float[Tensor, "n 3"],
+    camera: Camera,
+    depth: Float[Tensor, "height width"],
+    *,
+    tolerance: float,
+    near: float = 0.0,
+) -> SeenPoints:
+    """The points that one view saw.
+
+    Args:
+        points: World, float64.
+        camera: Of the view.
+        depth: Z-depth of its pixels, 0 where it is not known.
+        tolerance: Tau, scene units.
+        near: Z-depth up to which nothing is seen.
+    """
+    pixels, z = camera.project(points)
+    size = pixels.new_tensor([camera.width, camera.height])
+    inside = (z > near) & ((pixels >= 0) & (pixels < size)).all(dim=1)
+    found = torch.nonzero(inside).squeeze(1)
+    columns, rows = pixels[found].long().unbind(dim=1)
+    surface = depth[rows, columns].double()
+    seen = (surface > 0) & (z[found] <= (1 + RELATIVE_TOLERANCE) * surface + tolerance)
+    return SeenPoints(
+        points=found[seen], columns=columns[seen], rows=rows[seen], depth=z[found[seen]]
+    )
+
+
+@boundary
+def points_in_sight(
+    points: Float[Tensor, "n 3"],
+    views: Iterable[tuple[Camera, Float[Tensor, "height width"]]],
+    *,
+    metres_per_unit: float = 1.0,
+) -> Bool[Tensor, "n"]:
+    """Which points at least one view saw.
+
+    Args:
+        points: World, scene units.
+        views: Cameras with z-depth maps of their size, scene units, 0 where it is not known; taken
+            one at a time.
+        metres_per_unit: Length of a scene unit.
+
+    Raises:
+        ShapeError: If the points are not (n, 3), or a map is not of its camera's size.
+        RangeError: If a point is not finite.
+    """
+    check_shape("points", points, (None, 3))
+    check_finite("points", points)
+    at = points.detach().cpu().double()
+    found = torch.zeros(len(at), dtype=torch.bool)
+    for camera, depth in views:
+        check_shape("depth", depth, (camera.height, camera.width))
+        left = torch.nonzero(~found).squeeze(1)
+        seen = seen_points(
+            at[left],
+            camera,
+            depth,
+            tolerance=SIGHT_TOLERANCE / metres_per_unit,
+        )
+        found[left[seen.points]] = True
+    return found
+
+
+_NEAR = 1e-3
+"""z-depth, as a part of the length in which views count in full, below which nothing is seen."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SeenView:
+    """What a view of a field shows: labels, and where."""
+
+    camera: Camera
+
+    columns: Int[Tensor, "height width"]
+    """Columns of the table of votes, -1 where there is no label."""
+
+    depth: Float[Tensor, "height width"]
+    """Median z-depth, scene units, 0 where nothing is."""
+
+
+def view_votes(
+    views: Iterable[SeenView],
+    points: Float[Tensor, "n 3"],
+    labels: int,
+    *,
+    metres_per_unit: float,
+) -> Float[Tensor, "n c"]:
+    """How many views vote for each label at each point, far ones less.
+
+    Args:
+        views: What they show, in the order in which votes are summed.
+        points: World, scene units.
+        labels: Columns of the table.
+        metres_per_unit: Length of a scene unit.
+    """
+    votes = torch.zeros(len(points), labels)
+    flat = votes.view(-1)
+    at, full_distance = points.double(), FULL_DISTANCE / metres_per_unit
+    for view in views:
+        seen = seen_points(
+            at,
+            view.camera,
+            view.depth,
+            tolerance=VOTE_TOLERANCE / metres_per_unit,
+            near=_NEAR * full_distance,
+        )
+        label = view.columns[seen.rows, seen.columns].long()
+        named = label >= 0
+        weight = (full_distance / seen.depth[named]).clamp_max(1).float()
+        # A view names each point once, so that nothing is added twice to one number.
+        flat[seen.points[named] * labels + label[named]] += weight
+    return votes
+
+
+_FIXED = "it is fixed at the value that was best"
+
+
+@options(
+    removed=dict.fromkeys(
+        (
+            "tolerance", "relative_tolerance", "full_distance", "shape_votes", "trees", "samples",
+            "smoothing", "smoothing_width", "normal_width", "overlap",
+        ),
+        _FIXED,
+    )
+)  # fmt: skip
 class ViewedPointOptions:
-    """How points take labels from views and shapes. Lengths are metres."""
+    """How points take labels from views and shapes."""
 
-    cell: float = 0.1
-    """Side of the cells that points are thinned to: a label for all points of a cell."""
-
-    tolerance: float = 0.3
-    """How far behind the surface that a view shows a point may lie to be seen."""
-
-    relative_tolerance: float = 0.03
-    """The same, as a part of the surface's depth; both together count."""
-
-    full_distance: float = 10.0
-    """Views up to here have a full vote at a point, others less in inverse proportion."""
+    cell: Positive = 0.1
+    """Side of the cells that points are thinned to, metres; all points of a cell get one label."""
 
     shapes: bool = True
-    """Learn from the points that views see what shapes are called, for those that none sees."""
+    """Learn what shapes are called from the points that views see, for those that none sees."""
 
-    shape_votes: float = 2.0
-    """How many votes of views the word of shapes is worth."""
-
-    trees: int = 40
-    """Trees that learn shapes."""
-
-    samples: int = 10_000
-    """Cells of each label that they learn from, at most."""
-
-    smoothing_steps: int = 10
-    """Steps along surfaces; 0 is none."""
-
-    smoothing: float = 0.7
-    """What neighbours count together beside a cell's own votes, in [0, 1]."""
-
-    smoothing_width: float = 0.3
-    """Standard deviation of the distance at which neighbours count."""
-
-    normal_width: float = 0.2
-    """By how much of 1 - |cos| of their normals neighbours count e times less."""
+    smoothing_steps: Natural = 10
+    """Steps of smoothing along surfaces; 0 is none."""
 
     absent: tuple[str, ...] = ("sky",)
     """Names of classes that no point can have: what the laser hit is something."""
 
-    window: int = 32
+    window: Count = 32
     """Scans put together to be labelled, of a source of scans."""
 
-    overlap: int = 8
-    """Scans on either side of these that are looked at with them."""
-
-    memory: int = 1 << 29
-    """Bytes of drawn views that are kept for later points."""
+    memory: Count = 1 << 29
+    """Bytes of rendered views that are kept for later points."""
 
     seed: int = 0
-    """Of the trees."""
-
-    def __post_init__(self) -> None:
-        convert_fields(self)
-        for name in _POSITIVE:
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0):
-                raise RangeError(f"{name}: expected a positive number, got {value}.")
-        for name in _NOT_NEGATIVE:
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value >= 0):
-                raise RangeError(f"{name}: expected 0 or more, got {value}.")
-        for name in _AT_LEAST_ONE:
-            if getattr(self, name) < 1:
-                raise RangeError(f"{name}: expected at least 1, got {getattr(self, name)}.")
-        for name in ("smoothing_steps", "overlap"):
-            if getattr(self, name) < 0:
-                raise RangeError(f"{name}: expected 0 or more, got {getattr(self, name)}.")
-        check_range("smoothing", self.smoothing, 0.0, 1.0)
+    """Of the forest."""
 
 
 class ViewedPoints:
@@ -209,7 +331,7 @@ class ViewedPoints:
                 points, rows = self._window(scans, names, start)
                 own = slice(rows[0][1].start, rows[-1][1].stop)
                 found = self._sample(self._cloud(points, layer, ids), own)
-                sample = [drawn([*sample, found], self._options.samples)]
+                sample = [drawn([*sample, found], SAMPLES)]
         forest = self._forest(sample)
         for start in range(0, len(names), self._options.window):
             points, rows = self._window(scans, names, start)
@@ -225,8 +347,8 @@ class ViewedPoints:
         parts: list[Tensor] = []
         rows: list[tuple[str, slice]] = []
         count = 0
-        for index in range(max(0, start - self._options.overlap), len(names)):
-            if index >= end + self._options.overlap:
+        for index in range(max(0, start - OVERLAP), len(names)):
+            if index >= end + OVERLAP:
                 break
             points = scans.scan(names[index]).points
             if start <= index < end:
@@ -243,16 +365,14 @@ class ViewedPoints:
 
     def _cloud(self, points: Float[Tensor, "p 3"], layer: str, ids: tuple[int, ...]) -> "_Cloud":
         cells = thin(points, self._options.cell / self._unit)
-        around = surroundings(cells.centres * self._unit, self._up)
+        shapes = local_shapes(cells.centres * self._unit, self._up)
         votes = view_votes(
             (self._seen(layer, index, ids) for index in range(len(self._cameras))),
             cells.centres,
             len(ids),
-            tolerance=self._options.tolerance / self._unit,
-            relative_tolerance=self._options.relative_tolerance,
-            full_distance=self._options.full_distance / self._unit,
+            metres_per_unit=self._unit,
         )
-        return _Cloud(cells=cells, around=around, votes=votes)
+        return _Cloud(cells=cells, shapes=shapes, votes=votes)
 
     def _seen(self, layer: str, index: int, ids: tuple[int, ...]) -> SeenView:
         """What a view shows, drawn once while memory lasts."""
@@ -280,20 +400,20 @@ class ViewedPoints:
         known = mine & (total > 0)
         best, label = cloud.votes[known].max(dim=1)
         whole = ShapeSamples(
-            features=cloud.around.features[known],
+            features=cloud.shapes.features[known],
             labels=label,
             weights=best / total[known],
             hashes=cloud.cells.hashes[known],
             totals=torch.bincount(label, minlength=cloud.votes.shape[1]).double(),
         )
-        return drawn([whole], self._options.samples)
+        return drawn([whole], SAMPLES)
 
     def _forest(self, samples: Sequence[ShapeSamples]) -> ShapeForest | None:
         """What shapes are called; None where that is not asked for, or views saw nothing."""
         if not self._options.shapes or not sum(len(sample) for sample in samples):
             return None
-        sample = drawn(samples, self._options.samples)
-        return ShapeForest(sample, trees=self._options.trees, seed=self._options.seed)
+        sample = drawn(samples, SAMPLES)
+        return ShapeForest(sample, trees=TREES, seed=self._options.seed)
 
     def _decided(
         self, cloud: "_Cloud", forest: ShapeForest | None, ids: tuple[int, ...]
@@ -301,17 +421,10 @@ class ViewedPoints:
         options = self._options
         table, total = cloud.votes, cloud.votes.sum(dim=1, keepdim=True)
         if forest is not None:
-            table = table + options.shape_votes * forest.shares(cloud.around.features)
-            total = total + options.shape_votes
+            table = table + SHAPE_VOTES * forest.shares(cloud.shapes.features)
+            total = total + SHAPE_VOTES
         shares = torch.where(total > 0, table / total.clamp_min(1e-30), 0.0)
-        shares = smoothed(
-            shares,
-            cloud.around,
-            steps=options.smoothing_steps,
-            weight=options.smoothing,
-            width=options.smoothing_width,
-            normal_width=options.normal_width,
-        )
+        shares = smoothed(shares, cloud.shapes, steps=options.smoothing_steps)
         out = torch.full((len(shares),), UNLABELLED, dtype=torch.int32)
         confidence = torch.zeros(len(shares))
         if ids and len(shares):
@@ -324,10 +437,10 @@ class ViewedPoints:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Cloud:
-    """Cells of points, what is around them, and the votes of views."""
+    """Cells of points, their shapes, and the votes of views."""
 
     cells: Thinned
-    around: Surroundings
+    shapes: LocalShapes
     votes: Float[Tensor, "n c"]
 
 

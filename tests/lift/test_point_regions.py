@@ -5,7 +5,8 @@ import torch
 
 from lift.test_point_labels import gaussians_at
 from splatseg.errors import RangeError, ShapeError
-from splatseg.lift.points import RegionOptions, region, region_labels
+from splatseg.lift import point_regions
+from splatseg.lift.point_regions import region_labels
 
 HERE = torch.zeros(1, 3)
 
@@ -16,7 +17,7 @@ def test_most_centres_in_the_ball_decide_whatever_their_opacity() -> None:
     found = region_labels(scene, ids, torch.tensor([[0.0, 0, 0], [5.2, 0, 0], [9.0, 0, 0]]))
     assert found.ids.tolist() == [2, 7, -1]
     assert found.confidence.tolist() == pytest.approx([2 / 3, 1, 0])
-    small = region_labels(scene, ids, HERE, options=RegionOptions(radius=0.1))
+    small = region_labels(scene, ids, HERE, radius=0.1)
     assert small.ids.tolist() == [1]
 
 
@@ -26,8 +27,7 @@ def test_weights_make_centres_count_for_what_was_seen_of_them() -> None:
     weights = torch.tensor([9.0, 1.0, 1.0])
     assert region_labels(scene, ids, HERE).ids.tolist() == [2]
     assert region_labels(scene, ids, HERE, weights=weights).ids.tolist() == [1]
-    hidden = RegionOptions(min_weight=9.0)
-    assert region_labels(scene, ids, HERE, weights=weights, options=hidden).ids.tolist() == [-1]
+    assert region_labels(scene, ids, HERE, weights=0 * weights).ids.tolist() == [-1]
 
 
 def test_centres_without_a_label_do_not_vote_and_ties_go_to_the_smaller_id() -> None:
@@ -49,7 +49,7 @@ def test_it_is_the_loop(rng, monkeypatch) -> None:
                 votes[id] += float(weight)
         best = max(votes, key=lambda id: (votes[id], -id))
         expected.append(best if votes[best] > 0 else -1)
-    monkeypatch.setattr(region, "_POINTS", 7)
+    monkeypatch.setattr(point_regions, "_POINTS", 7)
     found = region_labels(scene, ids, points, weights=weights)
     assert found.ids.tolist() == expected
     assert -1 in expected
@@ -57,10 +57,8 @@ def test_it_is_the_loop(rng, monkeypatch) -> None:
 
 def test_bad_input_is_refused() -> None:
     scene = gaussians_at([[0, 0, 0]])
-    with pytest.raises(RangeError, match="radius: expected a positive number"):
-        RegionOptions(radius=0)
-    with pytest.raises(RangeError, match="min_weight: expected 0 or more"):
-        RegionOptions(min_weight=-1)
+    with pytest.raises(RangeError, match="radius: expected more than 0"):
+        region_labels(scene, torch.tensor([1]), HERE, radius=0)
     with pytest.raises(ShapeError, match="ids"):
         region_labels(scene, torch.tensor([1, 2]), HERE)
     with pytest.raises(ShapeError, match="weights"):

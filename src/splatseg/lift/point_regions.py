@@ -13,39 +13,18 @@ References:
     Yan et al., Street Gaussians (ECCV 2024).
 """
 
-from dataclasses import dataclass
-
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from splatseg._check import check_finite, check_shape
 from splatseg.core import UNLABELLED, Gaussians, PointLabels
-from splatseg.core.boundary import boundary, convert_fields
+from splatseg.core.boundary import boundary
 from splatseg.errors import RangeError
 from splatseg.neighbours import NeighbourIndex
 
 _POINTS = 4096
 _MAX_PAIRS = 1 << 25
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RegionOptions:
-    """How regions vote."""
-
-    radius: float = 0.5
-    """Of the ball, scene units, positive."""
-
-    min_weight: float = 0.0
-    """Centres of this weight or less have no vote. With weights of visibility this leaves out
-    what is hidden."""
-
-    def __post_init__(self) -> None:
-        convert_fields(self)
-        if not self.radius > 0:
-            raise RangeError(f"radius: expected a positive number, got {self.radius}.")
-        if not self.min_weight >= 0:
-            raise RangeError(f"min_weight: expected 0 or more, got {self.min_weight}.")
 
 
 @boundary
@@ -55,7 +34,7 @@ def region_labels(
     points: Float[Tensor, "p 3"],
     *,
     weights: Float[Tensor, "n"] | None = None,
-    options: RegionOptions | None = None,
+    radius: float = 0.5,
 ) -> PointLabels:
     """The label of most centres in a ball around each point.
 
@@ -65,17 +44,19 @@ def region_labels(
         gaussians: The Gaussians of the scene.
         ids: Their labels, -1 none.
         points: Positions in the world, scene units.
-        weights: What the vote of each centre counts, not negative; None is 1, as published.
-        options: The ball.
+        weights: What the vote of each centre counts; None is 1, as published. Those of weight 0
+            have none.
+        radius: Of the ball, scene units.
 
     Returns:
         Ids, -1 where no centre votes, and as confidence the winner's share of the votes.
 
     Raises:
         ShapeError: If there is not one id or weight a Gaussian, or points are not (p, 3).
-        RangeError: If a point or weight is not finite.
+        RangeError: If a point or weight is not finite, or the radius not above 0.
     """
-    options = options or RegionOptions()
+    if not radius > 0:
+        raise RangeError(f"radius: expected more than 0, got {radius}.")
     check_shape("points", points, (None, 3))
     check_finite("points", points)
     check_shape("ids", ids, (len(gaussians),))
@@ -83,7 +64,7 @@ def region_labels(
     check_shape("weights", given, (len(gaussians),))
     check_finite("weights", given)
     known = ids.detach().cpu().long()
-    voting = (known != UNLABELLED) & (given > options.min_weight)
+    voting = (known != UNLABELLED) & (given > 0)
     present, column = torch.unique(known[voting], return_inverse=True)
     out = torch.full((len(points),), UNLABELLED, dtype=torch.int32)
     confidence = torch.zeros(len(points))
@@ -94,7 +75,7 @@ def region_labels(
     for start in range(0, len(points), _POINTS):
         part = slice(start, start + _POINTS)
         found = index.within(
-            points[part].detach().cpu().double(), options.radius, max_pairs=_MAX_PAIRS
+            points[part].detach().cpu().double(), radius, max_pairs=_MAX_PAIRS
         )
         votes = torch.zeros(len(found), len(present), dtype=torch.float64)
         at = found.queries * len(present) + column[found.indices]

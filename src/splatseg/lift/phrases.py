@@ -7,7 +7,7 @@ can be seen: what it is called, which colour it has, what it stands on. So each 
           - \beta \, \frac{\Delta E(c_k, c)}{20}
           + \gamma \log \Bigl( \epsilon + \sum_j q_j \, [k \text{ on } j] \Bigr)
 
-with the cosine of the phrase, the probability of its name (`lift.words.answers`), the distance of
+with the cosine of the phrase, the probability of its name (`lift.words`), the distance of
 the thing's colour in CIELAB, lightness halved because shadows change it, and q the things that the
 rest of the phrase may mean, by their own names and colours. The largest s is what is meant, and
 others are as sure as they come near it:
@@ -35,7 +35,7 @@ from splatseg.core import Gaussians
 from splatseg.core.rigid import upright
 from splatseg.core.sh import base_colours
 from splatseg.lift.vocabulary import Vocabulary
-from splatseg.lift.words.answers import WordAnswers
+from splatseg.lift.words import TEMPERATURE, WordAnswers
 
 Relation = Literal["on", "near"]
 
@@ -250,8 +250,6 @@ def phrase_scores(
     cosines: Float[Tensor, "k"],
     looks: ThingLooks,
     name: Callable[[str], Float[Tensor, "k"] | None],
-    *,
-    temperature: float,
 ) -> Float[Tensor, "k"]:
     """S of each thing.
 
@@ -260,9 +258,8 @@ def phrase_scores(
         cosines: Of the whole phrase, in the span.
         looks: How things look.
         name: Probabilities of the name of what is called something; None where there is none.
-        temperature: Tau.
     """
-    found = temperature * cosines + _called(phrase, looks, name)
+    found = TEMPERATURE * cosines + _called(phrase, looks, name)
     reference, relation = phrase.reference, phrase.relation
     if reference is None or relation is None or name(reference.called) is None:
         return found
@@ -328,8 +325,6 @@ def answer_phrases(
     looks: Callable[[], ThingLooks],
     vocabulary: Vocabulary,
     ask: Callable[[str], Float[Tensor, "k"]],
-    *,
-    temperature: float,
 ) -> tuple[Float[Tensor, "k words"], Float[Tensor, "k words"]]:
     """Scores and probabilities of phrases that say more than a name, and of words as they were.
 
@@ -338,12 +333,11 @@ def answer_phrases(
         looks: How things look; asked for if a phrase needs it.
         vocabulary: The words that are known.
         ask: Probabilities of a word.
-        temperature: Tau.
 
     Returns:
         S, tau times the cosine for plain words, and p.
     """
-    scores, sure = temperature * answers.cosines, answers.probabilities.clone()
+    scores, sure = TEMPERATURE * answers.cosines, answers.probabilities.clone()
     asked: dict[str, Tensor | None] = {}
     names = _names(vocabulary)  # "white board" is one, and is not taken apart
 
@@ -357,9 +351,7 @@ def answer_phrases(
         phrase = parse_phrase(text)
         if text in names or not phrase.is_compound:
             continue
-        found = phrase_scores(
-            phrase, answers.cosines[:, column], looks(), name, temperature=temperature
-        )
+        found = phrase_scores(phrase, answers.cosines[:, column], looks(), name)
         scores[:, column] = found
         sure[:, column] = sureness(found, sure[:, column], name(phrase.called))
     return scores, sure

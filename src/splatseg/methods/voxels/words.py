@@ -1,9 +1,16 @@
-r"""Words asked of voxels: as the paper compares them, or calibrated as objects are asked.
+"""Features of voxels stored in few bytes, and words asked of them as they are stored.
+
+Product quantisation cuts a row into parts and keeps for each the number of the nearest of 256
+vectors, which k-means finds for that part; a product with a query is then a sum of as many entries
+of a table.
 
 The paper's score of a voxel for a label is the cosine of its feature with the text embedding
-(section 3.5.1). In the span of the scene's features (`lift.words.span`) words that are rare compare
-as fairly as common ones; there the answers are those of `lift.words.answers`, with what the
-context of words needs computed once and kept.
+(section 3.5.1). In the span of the scene's features words that are rare compare as fairly as common
+ones; there the answers are those of `lift.words`, with what the context of words needs computed
+once.
+
+References:
+    Jegou, Douze and Schmid, Product Quantization for Nearest Neighbor Search (2011).
 """
 
 from collections.abc import Callable, Sequence
@@ -12,18 +19,30 @@ import torch
 from jaxtyping import Float, Float32
 from torch import Tensor
 
-from splatseg._check import check_shape
+from splatseg._check import check_finite, check_shape
+from splatseg._native import code_sums, row_products
 from splatseg.core.boundary import boundary
 from splatseg.core.threads import one_torch_thread
-from splatseg.core.voxel_features import StoredTable, VoxelFeatures
-from splatseg.errors import InputError, ShapeError
+from splatseg.core.voxel_features import CODES, StoredPrecision, StoredTable, VoxelFeatures
+from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.lift.relevancy import TextSpace
 from splatseg.lift.vocabulary import Vocabulary
-from splatseg.lift.voxels.storage import products, store
-from splatseg.lift.words import AnswerOptions, WordAnswers, WordSpan, context_of, word_span
+from splatseg.lift.words import (
+    MIN_ENERGY,
+    SAME_MEANING,
+    TEMPERATURE,
+    WordAnswers,
+    WordSpan,
+    context_of,
+    word_span,
+)
 
+_HALF_MAX = 65504.0
+_BYTE_MAX = 127.0
+_TRAINING_ROWS = 8192
+_ROUNDS = 12
 _AT_ONCE = 8192
-"""Rows that are widened at a time."""
+"""Rows that are widened, or held against means, at a time."""
 
 _SPAN_ROWS = 20_000
 """Rows, evenly among all, that the span is found from."""
@@ -34,6 +53,119 @@ _MAX_EXPONENT = 80.0
 
 LastLayers = Callable[[Tensor], Tensor]
 """The last layers of an image encoder: features before them -> vectors in the space of words."""
+
+
+@boundary
+def store(
+    values: Float[Tensor, "m channels"],
+    *,
+    precision: StoredPrecision = "float16",
+    parts: int = 64,
+    seed: int = 0,
+) -> StoredTable:
+    """Rows of numbers as a table of a precision.
+
+    Args:
+        values: Features, one row a voxel.
+        precision: How numbers are kept: 4, 2 or 1 bytes each, or with product a byte for each part
+            of a row.
+        parts: With product: parts of a row at most; the most that divide the channels are taken.
+        seed: With product: of the rows that k-means begins with.
+
+    Raises:
+        RangeError: If a value is not finite, or beyond 65504 and to be kept in float16, or `parts`
+            is below 1.
+    """
+    check_finite("values", values)
+    if parts < 1:
+        raise RangeError(f"parts: expected at least 1, got {parts}.")
+    values = values.detach().cpu().float().contiguous()
+    if precision == "product":
+        return _quantised(values, parts, seed)
+    if precision == "int8":
+        largest = values.abs().amax(dim=1) if values.shape[1] else torch.zeros(len(values))
+        scales = torch.where(largest > 0, largest / _BYTE_MAX, 1.0)
+        codes = (values / scales[:, None]).round().clamp(-_BYTE_MAX, _BYTE_MAX).to(torch.int8)
+        return StoredTable(codes=codes, scales=scales)
+    if precision == "float32":
+        return StoredTable(codes=values)
+    largest = float(values.abs().max()) if values.numel() else 0.0
+    if largest > _HALF_MAX:
+        raise RangeError(
+            f"values: expected magnitudes of at most {_HALF_MAX:g} for float16, got {largest:g}; "
+            "take float32."
+        )
+    return StoredTable(codes=values.half())
+
+
+@boundary
+def products(table: StoredTable, vectors: Float[Tensor, "k channels"]) -> Float32[Tensor, "m k"]:
+    """Product of each row with each vector; rows are read as they are kept, and once.
+
+    The result does not depend on the number of threads.
+
+    Args:
+        table: The rows.
+        vectors: Any number of them.
+
+    Raises:
+        ShapeError: If widths do not fit.
+    """
+    check_shape("vectors", vectors, (None, table.channels))
+    vectors = vectors.detach().cpu().float().contiguous()
+    out = torch.empty(len(table), len(vectors))
+    if table.codebooks is not None:
+        parts, _, width = table.codebooks.shape
+        cut = vectors.reshape(len(vectors), parts, width)
+        with one_torch_thread():
+            tables = torch.einsum("psw,kpw->kps", table.codebooks.float(), cut).contiguous()
+        code_sums(table.codes.contiguous(), tables, out)
+        return out
+    codes = table.codes.contiguous()
+    row_products(codes.view(torch.int16) if codes.dtype == torch.float16 else codes, vectors, out)
+    return out if table.scales is None else out * table.scales[:, None]
+
+
+def _quantised(values: Tensor, parts: int, seed: int) -> StoredTable:
+    """A table by product quantisation, of the most parts that divide the channels."""
+    count, channels = values.shape
+    parts = max(1, min(parts, channels))
+    while channels % parts:
+        parts -= 1
+    width = channels // parts
+    cut = values.reshape(count, parts, width)
+    generator = torch.Generator().manual_seed(seed)
+    chosen = torch.randperm(count, generator=generator)[:_TRAINING_ROWS]
+    codebooks = torch.zeros(parts, CODES, width)
+    codes = torch.zeros(count, parts, dtype=torch.uint8)
+    with one_torch_thread():
+        for part in range(parts):
+            rows = cut[:, part].contiguous()
+            codebooks[part] = _means(rows[chosen])
+            codes[:, part] = _nearest(rows, codebooks[part]).to(torch.uint8)
+    return StoredTable(codes=codes, codebooks=codebooks)
+
+
+def _means(rows: Float[Tensor, "n width"]) -> Float[Tensor, "codes width"]:
+    """256 means of rows by k-means; it begins with the first rows, which are in random order."""
+    centres = torch.zeros(CODES, rows.shape[1])
+    if not len(rows):
+        return centres
+    centres[:] = rows[torch.arange(CODES) % len(rows)]
+    for _ in range(_ROUNDS):
+        nearest = _nearest(rows, centres)
+        counts = torch.bincount(nearest, minlength=CODES)
+        sums = torch.zeros(CODES, rows.shape[1], dtype=torch.float64)
+        sums.index_add_(0, nearest, rows.double())
+        # A mean that lost all its rows stays where it was.
+        found = (sums / counts.clamp_min(1)[:, None]).float()
+        centres = torch.where(counts[:, None] > 0, found, centres)
+    return centres
+
+
+def _nearest(rows: Tensor, centres: Tensor) -> Tensor:
+    half = 0.5 * (centres * centres).sum(dim=1)
+    return torch.cat([(part @ centres.T - half).argmax(dim=1) for part in rows.split(_AT_ONCE)])
 
 
 class TableWords:
@@ -83,8 +215,7 @@ class TableWords:
         if components is not None:
             self._span = self._found_span(components)
             self._inside = store(self._projected(self._span), precision="float32")
-        self._context: tuple[tuple[tuple[str, ...], AnswerOptions], StoredTable, Tensor] | None
-        self._context = None
+        self._context: tuple[StoredTable, Tensor] | None = None
 
     def __len__(self) -> int:
         """How many rows there are."""
@@ -107,20 +238,20 @@ class TableWords:
 
     @boundary
     def cosines(
-        self, vectors: Float[Tensor, "k width"], *, least_energy: float = 0.0
+        self, vectors: Float[Tensor, "k width"], *, min_energy: float = 0.0
     ) -> Float32[Tensor, "m k"]:
         """Cosine of each row with each vector, 0 where one has no length.
 
         Args:
             vectors: Vectors of words, any number.
-            least_energy: As in `WordSpan.cosines`; nothing in the whole space.
+            min_energy: As in `WordSpan.cosines`; nothing in the whole space.
         """
         words = torch.nn.functional.normalize(vectors.float(), dim=1)
         if self._span is not None:
             with one_torch_thread():
                 inside = words @ self._span.directions.T
                 energy = inside.norm(dim=1)
-                kept = energy / (energy.square() + least_energy**2).sqrt().clamp_min(_TINY)
+                kept = energy / (energy.square() + min_energy**2).sqrt().clamp_min(_TINY)
                 scaled = torch.nn.functional.normalize(inside, dim=1) * kept[:, None]
             return products(self._inside, scaled)
         space = self._vocabulary.space
@@ -134,13 +265,7 @@ class TableWords:
         return found * inverse[:, None]
 
     @boundary
-    def ask(
-        self,
-        words: Sequence[str],
-        *,
-        context: Sequence[str] | None = None,
-        options: AnswerOptions | None = None,
-    ) -> WordAnswers:
+    def ask(self, words: Sequence[str]) -> WordAnswers:
         """What each row answers, see `lift.words.answer_words`.
 
         The result does not depend on the number of threads.
@@ -148,16 +273,14 @@ class TableWords:
         Raises:
             InputError: If there are no words, or nothing is known of one.
         """
-        options = options or AnswerOptions()
         asked = self._vocabulary.vectors(words)
-        others = context_of(self._vocabulary) if context is None else tuple(context)
+        others = context_of(self._vocabulary)
         rivals = self._vocabulary.vectors(others) if others else asked[:0]
         cosines = self.cosines(asked)
-        tau = options.temperature
-        against, largest = self._against(others, rivals, options)
+        against, largest = self._against(rivals)
         with one_torch_thread():
-            held = ((rivals @ asked.T) < options.same_meaning).float()
-            own = tau * self.cosines(asked, least_energy=options.least_energy)
+            held = ((rivals @ asked.T) < SAME_MEANING).float()
+            own = TEMPERATURE * self.cosines(asked, min_energy=MIN_ENERGY)
             own = torch.exp((own - largest[:, None]).clamp_max(_MAX_EXPONENT))
             found = own / (own + products(against, held.T.contiguous())).clamp_min(_TINY)
         found[self._lengths <= 0] = 0
@@ -165,19 +288,14 @@ class TableWords:
             words=tuple(word.strip() for word in words), cosines=cosines, probabilities=found
         )
 
-    def _against(
-        self, others: tuple[str, ...], rivals: Tensor, options: AnswerOptions
-    ) -> tuple[StoredTable, Float32[Tensor, "m"]]:
-        """E to tau times the cosines of a context, less the largest of each voxel, and these."""
-        if self._context is not None and self._context[0] == (others, options):
-            return self._context[1:]
-        largest = torch.zeros(len(self))
-        scores = options.temperature * self.cosines(rivals, least_energy=options.least_energy)
-        if len(rivals):
-            largest = scores.amax(dim=1)
-        scores.sub_(largest[:, None]).exp_()
-        self._context = ((others, options), StoredTable(codes=scores), largest)
-        return self._context[1:]
+    def _against(self, rivals: Tensor) -> tuple[StoredTable, Float32[Tensor, "m"]]:
+        """E to tau times the cosines of the context, less the largest of each row, and these."""
+        if self._context is None:
+            scores = TEMPERATURE * self.cosines(rivals, min_energy=MIN_ENERGY)
+            largest = scores.amax(dim=1) if len(rivals) else torch.zeros(len(self))
+            scores.sub_(largest[:, None]).exp_()
+            self._context = StoredTable(codes=scores), largest
+        return self._context
 
     def _found_span(self, components: int) -> WordSpan:
         known = torch.nonzero(self._lengths > 0).squeeze(1)

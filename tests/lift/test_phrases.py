@@ -8,15 +8,17 @@ import torch
 from lift.conftest import gaussians_at
 from splatseg.io.evidence import TextEmbeddings
 from splatseg.lift import TextSpace
-from splatseg.lift.vocabulary import Vocabulary
-from splatseg.lift.words import WordAnswers, answer_phrases, thing_looks
-from splatseg.lift.words.phrases import (
+from splatseg.lift.phrases import (
     ThingLooks,
+    answer_phrases,
     known_name,
     parse_phrase,
     phrase_scores,
     sureness,
+    thing_looks,
 )
+from splatseg.lift.vocabulary import Vocabulary
+from splatseg.lift.words import WordAnswers
 
 SPACE = TextSpace(width=3)
 LABELS = ("mug", "desk", "white board", "desk lamp", "rubber duck", "duck", "red mug on the desk")
@@ -31,6 +33,11 @@ VOCABULARY = Vocabulary(
     ),
 )
 RED, GREEN, GREY = (0.78, 0.12, 0.12), (0.2, 0.59, 0.24), (0.5, 0.5, 0.5)
+
+
+@pytest.fixture(autouse=True)
+def ten_degrees(monkeypatch):
+    monkeypatch.setattr("splatseg.lift.phrases.TEMPERATURE", 10.0)
 
 
 @pytest.mark.parametrize(
@@ -111,7 +118,7 @@ def test_things_are_near_within_a_quarter_of_the_others_diagonal() -> None:
 def test_shares_of_what_is_meant_do_not_depend_on_the_chunk(monkeypatch) -> None:
     looks, meant = boxes(DESK, MUG, BESIDE, FAR), torch.tensor([0.7, 0.1, 0.1, 0.1])
     assert looks.share("on", meant).tolist() == pytest.approx([0, 0.7, 0, 0])
-    monkeypatch.setattr("splatseg.lift.words.phrases._AT_ONCE", 3)
+    monkeypatch.setattr("splatseg.lift.phrases._AT_ONCE", 3)
     assert looks.share("on", meant).tolist() == pytest.approx([0, 0.7, 0, 0])
     nowhere = boxes(DESK, MUG, has_up=False)
     assert nowhere.share("on", meant[:2]).tolist() == [1, 1], "nobody knows what is on what"
@@ -159,9 +166,7 @@ def test_scores_by_hand() -> None:
     looks = boxes(DESK, MUG, FAR)
     looks.colours[:] = torch.tensor([[light, a, b], [light + 8, a, b], [light, a + 6, b + 8]])
     names = {"red mug": torch.tensor([0.0, 0.5, 0.25]), "desk": torch.tensor([0.8, 0.1, 1e-9])}
-    found = phrase_scores(
-        phrase, torch.tensor([0.1, 0.2, 0.3]), looks, names.__getitem__, temperature=10.0
-    )
+    found = phrase_scores(phrase, torch.tensor([0.1, 0.2, 0.3]), looks, names.__getitem__)
     desk = 0.8 / (0.8 + 0.1 + 1e-3)
     expected = [
         1.0 + math.log(1e-3) + 2 * math.log(0.02),
@@ -171,7 +176,7 @@ def test_scores_by_hand() -> None:
     assert found.tolist() == pytest.approx(expected, abs=1e-4)
     # What has no name says nothing, and what a reference has no name of is not looked for.
     names = {"red mug": None, "desk": None}
-    found = phrase_scores(phrase, torch.zeros(3), looks, names.get, temperature=10.0)
+    found = phrase_scores(phrase, torch.zeros(3), looks, names.get)
     assert found.tolist() == pytest.approx([0.0, -3 * 4 / 20, -3 * 10 / 20], abs=1e-4)
 
 
@@ -216,7 +221,7 @@ def test_colours_tell_things_of_one_name_apart() -> None:
         asked.append(word)
         return {"mug": torch.tensor([0.9, 0.9, 0.0]), "desk": torch.tensor([0.0, 0.0, 0.9])}[word]
 
-    scores, sure = answer_phrases(whole, lambda: looks, VOCABULARY, ask, temperature=10.0)
+    scores, sure = answer_phrases(whole, lambda: looks, VOCABULARY, ask)
     assert torch.equal(scores[:, [0, 2]], 10 * whole.cosines[:, [0, 2]])
     assert torch.equal(sure[:, [0, 2]], whole.probabilities[:, [0, 2]])
     assert int(scores[:, 1].argmax()) == 1

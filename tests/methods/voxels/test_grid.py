@@ -7,10 +7,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from methods.voxels import reference
 from splatseg.core.voxels import VoxelGrid, cell_order
 from splatseg.errors import InputError, RangeError
-from splatseg.lift.voxels import reference
-from splatseg.lift.voxels.grid import GridIndex, voxelise, voxelise_to_count
+from splatseg.methods.voxels.grid import GridIndex, voxelise, voxelise_to_count
 
 
 def grid_of(cells, *, size=1.0, origin=(0.0, 0.0, 0.0)) -> VoxelGrid:
