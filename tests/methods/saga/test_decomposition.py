@@ -10,9 +10,8 @@ from splatseg import _native
 from splatseg.core import UNLABELLED, Features, Gaussians, InstanceTree, LayerInfo
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.io.layers import load_layer, save_layer
-from splatseg.lift import DecomposeOptions, decompose
-from splatseg.lift.affinity import QUANTILES, AffinityHead
-from splatseg.lift.decomposition.clusters import sampled, votes, ward
+from splatseg.lift.affinity import AffinityHead
+from splatseg.methods.saga.decomposition import DecomposeOptions, decompose, sampled, votes, ward
 
 EACH = 40
 """Gaussians of a part."""
@@ -55,7 +54,6 @@ class Nested:
             unit=True,
             gate_weight=torch.full((14,), -60.0),
             gate_bias=60 * closes,
-            scale_quantiles=torch.linspace(0, 1, QUANTILES, dtype=torch.float64),
             levels=(0.9, 0.45, 0.1),
         )
 
@@ -89,7 +87,7 @@ def test_groups_objects_and_parts_are_found(nested) -> None:
     assert tree.labels.confidence.min() > 0.5
     edit = tree.info.edit("decompose")
     assert edit is not None
-    assert edit["sample"] == DecomposeOptions().sample
+    assert edit["part_increase"] == DecomposeOptions().part_increase
     assert (tree.info.method, tree.info.seed, tree.info.head) == ("saga", 4, None)
 
 
@@ -202,18 +200,11 @@ LOOSE = DecomposeOptions(object_increase=0.02, part_increase=0.05, group_increas
 @pytest.mark.parametrize(
     "change",
     [
-        {"sample": 60},
-        {"part_sample": 20},
-        {"part_sample": 0},
-        {"neighbours": 3},
         {"group_increase": 0.2},
         {"group_increase": 0.0},
         {"object_increase": 0.1},
         {"part_increase": 0.3},
-        {"voters": 2},
-        {"temperature": 1.0},
-        {"candidates": 2},
-        {"candidates": 0},
+        {"part_increase": 0.0},
     ],
     ids=str,
 )
@@ -225,10 +216,21 @@ def test_every_option_changes_the_tree(nested, vague, change) -> None:
     assert not equal(*trees)
 
 
-def test_the_seed_changes_the_sample(nested, vague) -> None:
-    few = replace(LOOSE, sample=60)
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("SAMPLE", 60), ("PART_SAMPLE", 20), ("NEIGHBOURS", 3), ("VOTERS", 2), ("TEMPERATURE", 1.0),
+     ("CANDIDATES", 2)],
+)  # fmt: skip
+def test_every_constant_counts(nested, vague, monkeypatch, name, value) -> None:
+    usual = decompose(nested.gaussians, vague, options=LOOSE)
+    monkeypatch.setattr(f"splatseg.methods.saga.decomposition.{name}", value)
+    assert not equal(usual, decompose(nested.gaussians, vague, options=LOOSE))
+
+
+def test_the_seed_changes_the_sample(nested, vague, monkeypatch) -> None:
+    monkeypatch.setattr("splatseg.methods.saga.decomposition.SAMPLE", 60)
     first, second, again = (
-        decompose(nested.gaussians, vague, options=few, seed=seed) for seed in (0, 1, 0)
+        decompose(nested.gaussians, vague, options=LOOSE, seed=seed) for seed in (0, 1, 0)
     )
     assert equal(first, again)
     assert not equal(first, second)
@@ -272,19 +274,14 @@ def test_it_is_stored_as_a_tree(nested, tmp_path) -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"sample": 0}, "sample"),
-        ({"part_sample": -1}, "part_sample"),
-        ({"neighbours": 0}, "neighbours"),
-        ({"voters": 0}, "voters"),
-        ({"candidates": -1}, "candidates"),
         ({"object_increase": 0.0}, "object_increase"),
         ({"group_increase": 1.5}, "group_increase"),
         ({"part_increase": float("nan")}, "part_increase"),
-        ({"temperature": 0.0}, "temperature"),
+        ({"voters": 2}, "voters: this option was removed"),
     ],
 )
 def test_options_out_of_range(change, words) -> None:
-    with pytest.raises(RangeError, match=words):
+    with pytest.raises(InputError, match=words):
         DecomposeOptions(**change)
 
 
@@ -297,26 +294,27 @@ def test_a_sample_is_drawn_by_weight() -> None:
     assert sampled(weights, 5, rng).tolist() == [1, 2]
 
 
-def test_ward_by_hand() -> None:
+def test_ward_by_hand(monkeypatch) -> None:
     """Two and two samples at a right angle: joining them costs (2 * 2 / 4) * 2 / 4 = 1/2."""
     directions = torch.tensor([[1.0, 0], [1, 0], [0, 1], [0, 1]])
     points = torch.arange(4.0)[:, None].repeat(1, 3)
+    monkeypatch.setattr("splatseg.methods.saga.decomposition.NEIGHBOURS", 1)
     for increase, expected in ((0.49, [0, 0, 1, 1]), (0.51, [0, 0, 0, 0])):
-        found = ward(directions, points, neighbours=1, increase=increase)
+        found = ward(directions, points, increase=increase)
         # The nearest of the second is the first, of the third the second: a path of all.
         assert found.tolist() == expected
 
 
-def test_votes_by_hand() -> None:
+def test_votes_by_hand(monkeypatch) -> None:
     """Samples of two clusters around one Gaussian: exp(1 / tau) against 2 exp(0)."""
     directions = torch.tensor([[1.0, 0], [1, 0], [0, 1], [0, 1]])
     points = torch.tensor([[0.0, 0, 0], [0.1, 0, 0], [0.2, 0, 0], [0.3, 0, 0]])
     samples = torch.tensor([1, 2, 3])
-    index, shares = votes(
-        directions, points, samples, np.array([0, 1, 1]), voters=3, temperature=1.0
-    )
+    monkeypatch.setattr("splatseg.methods.saga.decomposition.TEMPERATURE", 1.0)
+    index, shares = votes(directions, points, samples, np.array([0, 1, 1]))
     assert index[0].tolist() == [0, 1, -1]
     share = np.e / (np.e + 2)
     assert shares[0].tolist() == pytest.approx([share, 1 - share, 0])
-    index, _ = votes(directions, points, samples, np.array([0, 1, 1]), voters=3, temperature=5.0)
+    monkeypatch.setattr("splatseg.methods.saga.decomposition.TEMPERATURE", 5.0)
+    index, _ = votes(directions, points, samples, np.array([0, 1, 1]))
     assert index[0].tolist() == [1, 0, -1]

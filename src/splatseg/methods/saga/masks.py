@@ -1,4 +1,4 @@
-r"""Features that start from the closed form: masks are associated, and nodes get codes.
+r"""Features that start from the closed form: masks are associated, and nodes get codes and scales.
 
 The channels are divided in three: parts, objects and groups, each node on the way from a Gaussian's
 own node to the root with a code of length 1 in its division,
@@ -17,7 +17,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64, Int64
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -224,29 +223,6 @@ def node_scales(tree: InstanceTree) -> dict[int, float]:
         part = PARTED_SCALE if node.id in parents else PART_SCALE
         found[node.id] = {"group": GROUP_SCALE, "object": OBJECT_SCALE, "part": part}[node.level]
     return found
-
-
-def level_scales(
-    tree: InstanceTree, nodes: Int64[Tensor, "masks"], sizes: Float64[Tensor, "masks"]
-) -> Float[Tensor, "masks"]:
-    """The scale of each mask: its level in a tree, from 0 for parts over objects to 1 for groups.
-
-    A mask that is no node has the scale that nodes' masks have at its rank of size; if none is a
-    node, all count as objects.
-
-    Args:
-        tree: The nodes.
-        nodes: Id of the node of each mask, -1 for none.
-        sizes: How large each mask is in 3D, scene units.
-    """
-    scale = {UNLABELLED: OBJECT_SCALE} | node_scales(tree)
-    found: NDArray[np.float64] = np.array([scale[id] for id in nodes.tolist()], dtype=np.float64)
-    known = nodes.numpy() != UNLABELLED
-    if known.any() and not known.all():
-        own, ladder = np.sort(sizes.numpy()[known]), np.sort(found[known])
-        rank = np.searchsorted(own, sizes.numpy()[~known]) / len(own)
-        found[~known] = ladder[np.minimum((rank * len(ladder)).astype(np.int64), len(ladder) - 1)]
-    return torch.from_numpy(found.astype(np.float32))
 
 
 def level_cut(scale: float) -> float:
