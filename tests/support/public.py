@@ -21,7 +21,6 @@ PACKAGES = (
     "io.video",
     "lift",
     "lift.training",
-    "lift.point_network",
     "methods",
     "models",
     "models.classical",

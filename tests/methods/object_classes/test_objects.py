@@ -4,18 +4,18 @@ from dataclasses import replace
 
 import pytest
 import torch
+from splatseg.methods.object_classes.objects import (
+    ObjectLabels,
+    label_objects,
+    named_by_tracks,
+    own_share,
+)
 
 from methods.cosseg.conftest import Maps
 from splatseg.core import LabelMap, Labels, LayerInfo
 from splatseg.errors import RangeError
-from splatseg.lift.object_classes import ObjectClassOptions, PooledObjects, pool_objects
 from splatseg.methods.object_classes import ObjectLabelOptions
-from splatseg.methods.object_classes._objects import (
-    ObjectLabels,
-    label_objects,
-    named_by_tracks,
-)
-from splatseg.methods.object_classes._shares import own_share
+from splatseg.methods.object_classes.classify import ObjectClassOptions, PooledObjects, pool_objects
 
 
 class Masks:
@@ -106,7 +106,7 @@ def pooled_features(halves, monkeypatch, **change):
         kept.append([scale.clone() for scale in scales])
         return pool_objects(objects, votes, scales, weights)
 
-    monkeypatch.setattr("splatseg.methods.object_classes._objects.pool_objects", keep)
+    monkeypatch.setattr("splatseg.methods.object_classes.objects.pool_objects", keep)
     labelled(halves, halves.evidence, **change)
     return kept[0]
 

@@ -6,8 +6,8 @@ import torch
 from splatseg.core import MaskSet, View
 from splatseg.lift.phrases import ThingLooks
 from splatseg.lift.words import WordAnswers
-from splatseg.methods.prompt._groups import answering, mask_groups
-from splatseg.methods.prompt._table import MaskTable
+from splatseg.methods.prompt.masks import MaskTable
+from splatseg.methods.prompt.words import answering, mask_groups
 from support.red_square import SIZE, camera
 
 PART, THING, GROUP, OTHER = range(4)

@@ -5,7 +5,7 @@ import torch
 
 from lift.conftest import camera_at, gaussians_at
 from splatseg.core import View
-from splatseg.methods.prompt._points import lifted, points_around, points_inside
+from splatseg.methods.prompt.views import lifted, points_around, points_inside
 from splatseg.render import prepare
 
 

@@ -133,7 +133,7 @@ def test_points_may_lie_in_views_that_are_not_used(fruit) -> None:
 
 def test_lifting_and_tolerance_matter(fruit) -> None:
     def points(**options):
-        from splatseg.methods.prompt._select import sampled_points, world_prompts
+        from splatseg.methods.prompt.select import sampled_points, world_prompts
 
         chosen = PromptOptions(negatives=0, **options)
         found = fruit.session(negatives=0).find("apple")[0]

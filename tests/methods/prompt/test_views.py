@@ -7,7 +7,7 @@ import torch
 from methods.prompt.conftest import camera_from
 from splatseg.core import View
 from splatseg.methods.prompt import initial_views
-from splatseg.methods.prompt._views import projected_views, view_positions
+from splatseg.methods.prompt.views import projected_views, view_positions
 
 
 def view_at(name: str, x: float, y: float = 0.0, turn: float = 0.0) -> View:

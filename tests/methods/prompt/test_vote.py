@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from splatseg.core import Rle
-from splatseg.methods.prompt._vote import MaskVotes, confidence_of
+from splatseg.methods.prompt.select import MaskVotes, confidence_of
 from splatseg.render import options_for, prepare, weights
 
 

@@ -14,9 +14,8 @@ from splatseg.io.evidence import TextEmbeddings
 from splatseg.lift import TextSpace
 from splatseg.lift.vocabulary import Vocabulary
 from splatseg.methods.prompt import PromptOptions, PromptSession, PromptSources, _table
-from splatseg.methods.prompt._linked import linked
-from splatseg.methods.prompt._table import mask_table, painted
-from splatseg.methods.prompt._words import MaskAnswers
+from splatseg.methods.prompt.masks import mask_table, painted
+from splatseg.methods.prompt.words import MaskAnswers, linked
 
 
 @pytest.fixture(scope="module")

@@ -295,7 +295,6 @@ def test_the_published_setting_is_that_of_the_paper() -> None:
     assert (CHANNELS, PUBLISHED_RATE) == (32, 0.0025)
     training = paper.training()
     assert (training.steps, training.adam, training.epsilon) == (30_000, "dense", 1e-15)
-    assert (training.beta1, training.beta2, training.warmup) == (0.9, 0.999, 0)
 
 
 def test_the_published_start_is_normal(walls) -> None:

@@ -14,10 +14,10 @@ from splatseg.core.json_values import plain_object
 from splatseg.errors import FileFormatError, InputError, MissingFileError, quoted
 from splatseg.io.foreign import is_file, made_from
 from splatseg.io.json_files import json_text, parse_object
+from splatseg.io.tensor_table import TensorTable
 from splatseg.io.tensors import read_safetensors, read_tensors
 from splatseg.io.tensors_writing import write_tensors
 from splatseg.io.torch_files import read_torch_file
-from splatseg.lift.point_network.tensor_table import TensorTable
 from splatseg.street.shapes.autoencoder import ShapeAutoEncoder, with_tensors
 from splatseg.street.shapes.config import ShapeConfig
 from splatseg.street.shapes.foreign import published_shapes

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from splatseg.errors import FileFormatError
 from splatseg.io.foreign import made_from
-from splatseg.lift.point_network.tensor_table import TensorTable
+from splatseg.io.tensor_table import TensorTable
 from splatseg.street.shapes.autoencoder import ShapeAutoEncoder, with_tensors
 from splatseg.street.shapes.config import MAX_LAYERS, PUBLISHED, ShapeConfig
 from splatseg.street.shapes.template import VERTICES
