@@ -1,4 +1,4 @@
-"""The masks of the initial views: what each shows, and which are masks of one thing.
+r"""The masks of the initial views: what each shows, and which are masks of one thing.
 
 Masks of two views are of one thing if they hold the same Gaussians. With :math:`m_{ki}` the
 blending weight of Gaussian i summed over the pixels of mask k of view u, and :math:`v_{ui}` that
@@ -35,14 +35,14 @@ from splatseg.core import (
     Rle,
     View,
 )
-from splatseg.core.boundary import boundary
+from splatseg.core.models import Image
 from splatseg.errors import InputError, ShapeError
 from splatseg.io.evidence import Evidence
 from splatseg.lift.mass.features import checked_grid
 from splatseg.lift.mass.segment_masses import ViewMasses, view_masses
 from splatseg.lift.phrases import ThingLooks, thing_looks
 from splatseg.methods.objects import MixingModel
-from splatseg.methods.prompt.words import image_of
+from splatseg.render import prepare
 
 _MIN_PIXELS = 16
 """Masks with fewer are no candidates."""
@@ -88,7 +88,6 @@ class MaskTable:
         return self.masks[int(self.view[row])].masks[int(self.index[row])]
 
 
-@boundary
 def mask_table(
     gaussians: Gaussians,
     views: Sequence[View],
@@ -247,9 +246,6 @@ def mask_overlaps(
     return torch.from_numpy(iou).float(), torch.from_numpy(contained).float()
 
 
-# A mask of each view from the points that fall into it: recorded, or by a promptable model.
-
-
 _MOST = 0.5
 
 _AT_ONCE = 32
@@ -406,3 +402,12 @@ def holds(masks: MaskSet, points: Tensor) -> Bool[Tensor, "m p"]:
 def _share(inside: Tensor, which: Tensor) -> Tensor:
     """Share of some points that each mask holds; 0 where there are no such points."""
     return inside[:, which].double().sum(dim=1) / max(int(which.sum()), 1)
+
+
+def image_of(gaussians: Gaussians, view: View, backend: str) -> Image:
+    """The photograph of a view, or its render where it has none."""
+    if view.image is not None:
+        return view.read_image()
+    with prepare(gaussians, view.camera, backend=backend) as prepared, torch.no_grad():
+        colour = prepared.render().image
+    return (colour.cpu().clamp(0, 1) * 255 + 0.5).to(torch.uint8)

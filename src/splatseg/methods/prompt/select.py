@@ -1,4 +1,6 @@
-"""Votes of views for Gaussians, by the masks of the views.
+r"""Objects found in some views become shares of Gaussians: points, masks of views, votes.
+
+Views are gone through once for all objects, each prepared once.
 
 With :math:`L_{ij} = [P_j \mu_i \in m_j]` (Prompt SA-GS, eq. 7) the share of a Gaussian is
 
@@ -25,8 +27,8 @@ from torch import Tensor
 
 from splatseg.core import Gaussians, Prompt, Rle, View
 from splatseg.lift.mass.centres import centres_in, unoccluded
-from splatseg.methods.prompt.options import PromptOptions, VoteRule
 from splatseg.methods.prompt.masks import PromptedMasks
+from splatseg.methods.prompt.options import PromptOptions, VoteRule
 from splatseg.methods.prompt.views import (
     lifted,
     points_around,
@@ -37,6 +39,16 @@ from splatseg.methods.prompt.views import (
 from splatseg.methods.prompt.words import FoundObject
 from splatseg.neighbours import NeighbourIndex
 from splatseg.render import PreparedView, RenderOptions, SparseImage, options_for, prepare
+
+POINTS, NEGATIVES = 2, 4
+"""Points taken in each initial mask, and around it; around it none of random ones."""
+
+DEPTH_TOLERANCE = 0.05
+"""How far behind the rendered median depth a point may lie, as a part of that depth."""
+
+MIN_VISIBILITY = 0.2
+"""With transposed votes: light in the views that vote, in shares of that of the median Gaussian of
+the object, below which one of it takes the share of its neighbours instead."""
 
 _STEEPNESS = 20.0
 _MOSTLY = 0.5
@@ -51,9 +63,6 @@ class MaskVotes:
         objects: How many objects there are.
         rule: How views vote.
         render_options: Switches of the blending model.
-        depth_tolerance: How far behind the median depth a centre is not hidden yet.
-        least_light: Of the transposed rule: light below which a Gaussian hardly shows, in shares of
-            the median of those that are mostly inside.
     """
 
     def __init__(
@@ -63,12 +72,8 @@ class MaskVotes:
         *,
         rule: VoteRule,
         render_options: RenderOptions,
-        depth_tolerance: float,
-        least_light: float,
     ) -> None:
-        self._gaussians, self._rule = gaussians, rule
-        self._least_light = least_light
-        self._options, self._tolerance = render_options, depth_tolerance
+        self._gaussians, self._rule, self._options = gaussians, rule, render_options
         self._inside = torch.zeros(objects, len(gaussians))
         self._total = torch.zeros(objects, 1 if rule == "published" else len(gaussians))
 
@@ -92,7 +97,7 @@ class MaskVotes:
             return
         centres = centres_in(self._gaussians.means, view.camera, near=self._options.near)
         if self._rule == "visible":
-            seen = unoccluded(centres, self._gaussians, prepared, tolerance=self._tolerance)
+            seen = unoccluded(centres, self._gaussians, prepared, tolerance=DEPTH_TOLERANCE)
             centres = centres[seen]
         column, row = centres.pixels.unbind(dim=1)
         for at, mask in masks:
@@ -134,7 +139,7 @@ class MaskVotes:
         inside = share > _MOSTLY
         if not bool(inside.any()):
             return share
-        shows = (light > 0) & (light >= self._least_light * light[inside].median())
+        shows = (light > 0) & (light >= MIN_VISIBILITY * light[inside].median())
         faint = torch.nonzero((share > tau) & ~shows).squeeze(1)
         if not len(faint):
             return share
@@ -160,11 +165,6 @@ def confidence_of(shares: Float[Tensor, "*batch"], tau: float) -> Float[Tensor, 
     found = torch.sigmoid(_STEEPNESS * (shares.double() - tau)).float()
     least = 0.5 + torch.finfo(torch.float32).eps
     return torch.where(shares > tau, found.clamp(least, 1.0), found.clamp(0.0, 0.5))
-
-
-# Objects found in some views become shares of Gaussians: points, masks of views, votes.
-#
-# Views are gone through once for all objects, each prepared once.
 
 
 _LIGHT = 0.5
@@ -207,7 +207,7 @@ class PromptShares:
     """What views say of some objects."""
 
     shares: Float[Tensor, "objects n"]
-    """Share of each Gaussian, in [0, 1], see `_vote`."""
+    """Share of each Gaussian, in [0, 1], see `MaskVotes`."""
 
     projected: tuple[int, ...]
     """How many views the points of each object were projected into."""
@@ -239,8 +239,8 @@ def sampled_points(
     for view, rle in found.masks:
         generator = torch.Generator().manual_seed(seed_of(seed, f"{key}:{view.name}"))
         mask = rle.decode()
-        inside = points_inside(mask, options.points, how=options.sampling, generator=generator)
-        around = points_around(mask, options.negatives, how=options.sampling, generator=generator)
+        inside = points_inside(mask, POINTS, how=options.sampling, generator=generator)
+        around = points_around(mask, NEGATIVES if options.sampling == "inside" else 0)
         signs = torch.arange(len(inside) + len(around)) < len(inside)
         pixels = torch.cat((inside, around))
         points.append(ViewPoints(view=view, pixels=pixels, positive=signs, area=rle.area))
@@ -281,7 +281,6 @@ def world_prompts(
                 gaussians,
                 torch.cat([one.pixels for _, one in here]),
                 how=options.lifting,
-                tolerance=options.tolerance,
             )
         start = 0
         for at, one in here:
@@ -345,8 +344,6 @@ def vote_for(
             len(prompts),
             rule=options.vote,
             render_options=options_for(gaussians, backend),
-            depth_tolerance=options.depth_tolerance,
-            least_light=options.least_light,
         )
         votes.add_views([len(one) for one in chosen])
         before, masks = masks, [[] for _ in prompts]
@@ -388,7 +385,7 @@ def _views_of(
                 views,
                 prompt.points[prompt.positive],
                 share=options.view_share,
-                how=options.view_choice,
+                how=options.sampling,
                 seed=seed_of(seed, prompt.key),
             )
         chosen.append({view.name for view in of_object})
@@ -410,10 +407,10 @@ def _shown(
     for at in objects:
         pixels, depth = view.camera.project(prompts[at].points)
         kept = (depth > 0) & ((pixels >= 0) & (pixels < size)).all(dim=1)
-        if options.occlusion == "depth" and bool(kept.any()):
+        if options.sampling == "inside" and bool(kept.any()):
             rows = torch.nonzero(kept).squeeze(1)
             surface = _median_depth(view, prepared, gaussians, pixels[rows])
-            hidden = (surface > 0) & (depth[rows] > surface * (1 + options.depth_tolerance))
+            hidden = (surface > 0) & (depth[rows] > surface * (1 + DEPTH_TOLERANCE))
             kept[rows[hidden]] = False
         positive = prompts[at].positive[kept]
         if bool(positive.any()):

@@ -15,8 +15,8 @@ from splatseg.core.models import GroundedMasks, TextFeatures
 from splatseg.errors import InputError, RangeError
 from splatseg.io.evidence import Evidence, FeatureEvidence
 from splatseg.lift.vocabulary import Vocabulary, vocabulary_of
-from splatseg.methods.prompt.options import PromptOptions
 from splatseg.methods.prompt.masks import ModelMasks, PromptedMasks, RecordedMasks, mask_table
+from splatseg.methods.prompt.options import PromptOptions
 from splatseg.methods.prompt.select import (
     PromptShares,
     ViewPoints,
@@ -237,7 +237,7 @@ class PromptSession:
             if not objects:
                 raise InputError(
                     f"words: nothing in the {len(self.initial)} initial views answers to "
-                    f"{word!r}; expected at least {self._options.least_probability:g} of a mask."
+                    f"{word!r}; expected at least {self._options.probability_limit:g} of a mask."
                 )
             found += objects
         seconds = {"find": time.perf_counter() - began}

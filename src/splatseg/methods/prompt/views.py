@@ -1,4 +1,4 @@
-"""Which views words are looked for in, and which ones points are projected into.
+r"""Which views words are looked for in and points are projected into, and the points themselves.
 
 Prompt SA-GS clusters views by where they are and how they are turned: k-means over
 
@@ -7,6 +7,17 @@ Prompt SA-GS clusters views by where they are and how they are turned: k-means o
 
 with :math:`c_j` the centre of view j and :math:`R_j` its rotation; the view nearest to the centre
 of each cluster is taken. Positions are taken from their mean, so that the origin does not matter.
+
+A point of a view becomes one of the world by (Prompt SA-GS, eq. 6)
+
+.. math:: \arg\min_\mu \{ d(\mu) : d(\mu) > 0,\; \| P \mu - p \|_1 < \varepsilon \}
+
+the nearest centre of a Gaussian that projects close to it. That may be a centre that nobody sees:
+of a faint Gaussian before the object, or of one that another thing hides. With ``weight`` it is the
+point on its ray at the depth of the Gaussian that has most blending weight in its row of W.
+
+Inside a mask, the first point is the one farthest from the rim; each further one is where the
+lesser of its distance to the rim and half the distance to the points before is largest.
 
 References:
     Prompt SA-GS (2024), section 4 and Table 1.
@@ -22,15 +33,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splatseg.core import Gaussians, View
-from splatseg.core.boundary import boundary
-from splatseg.methods.prompt.options import InitialViews, Lifting, PointSampling, ViewChoice
+from splatseg.methods.prompt.options import InitialViews, Lifting, PointSampling
 from splatseg.render import PreparedView
+
+TOLERANCE = 10.0
+"""Epsilon of eq. 6, in pixels, by the sum of both coordinates' differences."""
 
 _ROUNDS = 100
 _STARTS = 10
 
 
-@boundary
 def initial_views(
     views: Sequence[View], *, how: InitialViews = "kmeans", count: int = 4, seed: int = 0
 ) -> tuple[View, ...]:
@@ -120,13 +132,12 @@ def _distinct(squares: NDArray[np.float64]) -> list[int]:
     return taken
 
 
-@boundary
 def projected_views(
     views: Sequence[View],
     points: Float[Tensor, "k 3"],
     *,
     share: float,
-    how: ViewChoice = "coverage",
+    how: PointSampling = "inside",
     seed: int = 0,
 ) -> tuple[View, ...]:
     """The views that points are projected into, in the order of their names.
@@ -135,7 +146,7 @@ def projected_views(
         views: All views.
         points: Points of the object, world.
         share: Share of all views, in (0, 1]; at least one is taken.
-        how: See `PromptOptions.view_choice`.
+        how: See `PromptOptions.sampling`.
         seed: Of random choices.
     """
     ordered = sorted(views, key=lambda view: view.name)
@@ -188,20 +199,6 @@ def seed_of(seed: int, text: str) -> int:
     return zlib.crc32(f"{seed}:{text}".encode())
 
 
-# Points of masks: where they are taken, and the points of the world that they are.
-#
-# A point of a view becomes one of the world by (Prompt SA-GS, eq. 6)
-#
-# .. math:: \arg\min_\mu \{ d(\mu) : d(\mu) > 0,\; \| P \mu - p \|_1 < \varepsilon \}
-#
-# the nearest centre of a Gaussian that projects close to it. That may be a centre that nobody sees:
-# of a faint Gaussian before the object, or of one that another thing hides. With ``weight`` it is the
-# point on its ray at the depth of the Gaussian that has most blending weight in its row of W.
-#
-# Inside a mask, the first point is the one farthest from the rim; each further one is where the
-# lesser of its distance to the rim and half the distance to the points before is largest.
-
-
 _AROUND = (0.5, 2.0)
 """Distance of points around a mask from it, in radii of its largest circle."""
 
@@ -211,7 +208,6 @@ _MIN_AROUND = 3.0
 """The same in pixels, at least: recorded masks are ragged."""
 
 
-@boundary
 def points_inside(
     mask: Bool[Tensor, "height width"],
     count: int,
@@ -232,21 +228,12 @@ def points_inside(
     return _spread_pixels(_distance(mask), mask, count)
 
 
-@boundary
-def points_around(
-    mask: Bool[Tensor, "height width"],
-    count: int,
-    *,
-    how: PointSampling = "inside",
-    generator: torch.Generator | None = None,
-) -> Float[Tensor, "k 2"]:
+def points_around(mask: Bool[Tensor, "height width"], count: int) -> Float[Tensor, "k 2"]:
     """Points close to a mask and not in it, far from each other; none where there is no room.
 
     Args:
         mask: The mask.
         count: How many.
-        how: ``random`` takes any in the band around the mask.
-        generator: Of random ones.
     """
     if not count or not bool(mask.any()):
         return torch.zeros(0, 2)
@@ -260,8 +247,6 @@ def points_around(
     band = (away >= near) & (away <= max(far, near + 1))
     if not bool(band.any()):
         return torch.zeros(0, 2)
-    if how == "random":
-        return _random(band, count, generator)
     return _spread_pixels(torch.full(mask.shape, float("inf")), band, count)
 
 
@@ -305,7 +290,6 @@ def _spread_pixels(room: Tensor, mask: Tensor, count: int) -> Tensor:
     return torch.stack((columns[index], rows[index]), dim=1).float() + 0.5
 
 
-@boundary
 def lifted(
     view: View,
     prepared: PreparedView,
@@ -313,7 +297,6 @@ def lifted(
     pixels: Float[Tensor, "p 2"],
     *,
     how: Lifting = "weight",
-    tolerance: float = 10.0,
 ) -> tuple[Float[Tensor, "p 3"], Int64[Tensor, "p"]]:
     """Points of the world that pixels show, float64, and the Gaussian of each, -1 for none.
 
@@ -323,11 +306,10 @@ def lifted(
         gaussians: The Gaussians of the scene.
         pixels: x and y.
         how: See `PromptOptions.lifting`.
-        tolerance: Epsilon of eq. 6, pixels.
     """
     pixels = pixels.double()
     if how == "centre":
-        return _nearest_centres(view, gaussians, pixels, tolerance)
+        return _nearest_centres(view, gaussians, pixels)
     strongest = prepared.contributors(pixels.floor().long(), 1).ids[:, 0].cpu().long()
     centres = gaussians.means.detach().cpu().double()[strongest.clamp_min(0)]
     _, depth = view.camera.project(centres)
@@ -336,9 +318,7 @@ def lifted(
     return points, torch.where(usable, strongest, -1)
 
 
-def _nearest_centres(
-    view: View, gaussians: Gaussians, pixels: Tensor, tolerance: float
-) -> tuple[Tensor, Tensor]:
+def _nearest_centres(view: View, gaussians: Gaussians, pixels: Tensor) -> tuple[Tensor, Tensor]:
     """Eq. 6."""
     means = gaussians.means.detach().cpu().double()
     projected, depth = view.camera.project(means)
@@ -346,7 +326,7 @@ def _nearest_centres(
     projected, depth = projected[before], depth[before]
     found = torch.full((len(pixels),), -1, dtype=torch.int64)
     for row, pixel in enumerate(pixels):
-        close = torch.nonzero((projected - pixel).abs().sum(dim=1) < tolerance).squeeze(1)
+        close = torch.nonzero((projected - pixel).abs().sum(dim=1) < TOLERANCE).squeeze(1)
         if len(close):
             found[row] = before[close[depth[close].argmin()]]
     return means[found.clamp_min(0)], found

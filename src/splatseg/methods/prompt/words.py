@@ -1,4 +1,17 @@
-"""Masks of several views joined to things by what they share."""
+"""Words to masks in the initial views: by recorded features and masks, or by a grounding model.
+
+`MaskAnswers` asks every recorded mask. Its feature is told apart from its neighbours', those of one
+thing in several views are averaged, and words are compared with them in their span, each held
+against what else a thing could be (`lift.words`).
+
+`CellAnswers` is the plain way. In each view alone, the relevancy of a word in the cells of the
+feature map (`lift.relevancy`) has its maximum at some cell; the region is what hangs together with
+it above the middle between the maximum and the median. The recorded mask with the best IoU with the
+region is taken.
+
+`GroundedAnswers` asks a model, such as LangSAM (Grounding DINO and SAM), as published: of its masks
+the surest of each view.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,9 +31,8 @@ from splatseg.lift.phrases import answer_phrases
 from splatseg.lift.relevancy import relevancy
 from splatseg.lift.vocabulary import Vocabulary
 from splatseg.lift.words import TEMPERATURE, WordAnswers, answer_words, context_of, word_span
+from splatseg.methods.prompt.masks import MaskTable, image_of, mask_overlaps
 from splatseg.methods.prompt.options import PromptOptions
-from splatseg.methods.prompt.masks import MaskTable, mask_overlaps
-from splatseg.render import prepare
 
 SAME = 0.2
 """IoU from which on masks of two views are of one thing."""
@@ -51,9 +63,6 @@ def linked(
                 free.discard(best)
         objects.append(sorted(members, key=lambda one: views[one]))
     return objects
-
-
-# Objects of the initial views: a mask, and the masks of other views that are of the same thing.
 
 
 _FULL_CELLS = 50.0
@@ -179,21 +188,6 @@ def _of_same(table: MaskTable, members: Sequence[int]) -> Bool[Tensor, "m"]:
     return inside | around
 
 
-# Words to masks in the initial views: by recorded features and masks, or by a grounding model.
-#
-# `MaskAnswers` asks every recorded mask. Its feature is told apart from its neighbours', those of one
-# thing in several views are averaged, and words are compared with them in their span, each held
-# against what else a thing could be (`lift.words`).
-#
-# `CellAnswers` is the plain way. In each view alone, the relevancy of a word in the cells of the
-# feature map (`lift.relevancy`) has its maximum at some cell; the region is what hangs together with
-# it above the middle between the maximum and the median. The recorded mask with the best IoU with the
-# region is taken.
-#
-# `GroundedAnswers` asks a model, such as LangSAM (Grounding DINO and SAM), as published: of its masks
-# the surest of each view.
-
-
 _BETTER = 0.5
 """Relevancy above which a word fits better than every negative."""
 
@@ -244,7 +238,7 @@ class MaskAnswers:
             self._groups,
             answers,
             several=self._options.objects == "all",
-            least=self._options.least_probability,
+            least=self._options.probability_limit,
         )
 
     def _asked(self, word: str) -> WordAnswers:
@@ -322,7 +316,7 @@ class CellAnswers:
             space.cosines(values, self._negatives),
         )[..., 0]
         limit = max(float((found.max() + found.median()) / 2), _BETTER)
-        least = max(self._options.least_probability, _BETTER)
+        least = max(self._options.probability_limit, _BETTER)
         count, pieces = cv2.connectedComponents((found >= limit).numpy().astype(np.uint8))
         peaks = [
             (float(found[torch.from_numpy(pieces == one)].max()), one) for one in range(1, count)
@@ -414,7 +408,7 @@ class GroundedAnswers:
                 f"grounder: expected masks of {view.camera.width}x{view.camera.height} pixels, "
                 f"got {found.width}x{found.height}."
             )
-        least = self._options.least_probability
+        least = self._options.probability_limit
         sure = [i for i in range(len(found)) if float(found.scores[i]) >= least]
         sure.sort(key=lambda i: (-float(found.scores[i]), i))
         if self._options.objects == "one":
@@ -426,12 +420,3 @@ class GroundedAnswers:
             scores=found.scores[sure],
             levels=found.levels[sure],
         )
-
-
-def image_of(gaussians: Gaussians, view: View, backend: str) -> Image:
-    """The photograph of a view, or its render where it has none."""
-    if view.image is not None:
-        return view.read_image()
-    with prepare(gaussians, view.camera, backend=backend) as prepared, torch.no_grad():
-        colour = prepared.render().image
-    return (colour.cpu().clamp(0, 1) * 255 + 0.5).to(torch.uint8)

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from splatseg.core import Rle
+from splatseg.methods.prompt import select
 from splatseg.methods.prompt.select import MaskVotes, confidence_of
 from splatseg.render import options_for, prepare, weights
 
@@ -28,23 +29,20 @@ def shares(
     *,
     views: int | None = None,
     tolerance: float = 0.05,
-    least_light=0.0,
+    min_visibility=0.0,
     tau=0.5,
 ):
-    votes = MaskVotes(
-        fruit.gaussians,
-        2,
-        rule=rule,
-        render_options=options_for(fruit.gaussians, "auto"),
-        depth_tolerance=tolerance,
-        least_light=least_light,
-    )
-    votes.add_views([views or len(masks)] * 2)
-    for view in fruit.views:
-        if view.name in masks:
-            with prepare(fruit.gaussians, view.camera) as prepared:
-                votes.add(view, prepared, [(1, Rle.encode(masks[view.name]))])
-    found = votes.shares(tau)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(select, "DEPTH_TOLERANCE", tolerance)
+        patch.setattr(select, "MIN_VISIBILITY", min_visibility)
+        render_options = options_for(fruit.gaussians, "auto")
+        votes = MaskVotes(fruit.gaussians, 2, rule=rule, render_options=render_options)
+        votes.add_views([views or len(masks)] * 2)
+        for view in fruit.views:
+            if view.name in masks:
+                with prepare(fruit.gaussians, view.camera) as prepared:
+                    votes.add(view, prepared, [(1, Rle.encode(masks[view.name]))])
+        found = votes.shares(tau)
     assert not bool(found[0].any())
     return found[1]
 
@@ -82,7 +80,7 @@ def test_what_hardly_shows_answers_as_its_neighbours(fruit, masks) -> None:
     for row in torch.nonzero(faint).squeeze(1):
         near = (means[known] - means[row]).norm(dim=1).argsort()[:8]
         wanted[row] = plain[known[near]].mean()
-    found = shares(fruit, masks, "transposed", least_light=0.5, tau=0.3)
+    found = shares(fruit, masks, "transposed", min_visibility=0.5, tau=0.3)
     # Near the limits half precision of the weights decides.
     close = ((light - limit).abs() > 0.01 * limit) & ((plain - 0.3).abs() > 0.01)
     torch.testing.assert_close(found[close], wanted[close], rtol=0, atol=5e-3)
@@ -99,7 +97,7 @@ def test_published_divides_by_all_views(fruit, masks) -> None:
             inside = (depth > 0) & (column >= 0) & (column < 64) & (row >= 0) & (row < 48)
             hit = masks[view.name][row.clamp(0, 47), column.clamp(0, 63)]
             wanted += (inside & hit).float()
-    torch.testing.assert_close(shares(fruit, masks, "published", least_light=3.0), wanted / 5)
+    torch.testing.assert_close(shares(fruit, masks, "published", min_visibility=3.0), wanted / 5)
     # The wall behind the apple votes with it: nothing is hidden.
     torch.testing.assert_close(shares(fruit, masks, "published", views=10), wanted / 10)
     behind = (fruit.ids == 3) & (wanted > 0)
