@@ -1,19 +1,21 @@
-"""Classes of objects by loops: the equations of `lift.object_classes.classify`, one by one."""
+"""Classes of objects by loops: the equations of `methods.object_classes.classify`, one by one."""
 
 import numpy as np
 
+from splatseg.methods.object_classes import classify as constants
 
-def classified(votes, features, options, *, known):
+
+def classified(votes, features, *, known):
     """Probabilities (objects, classes), float64."""
     count, classes = votes.shape
     total = votes.sum(axis=1)
     shares = votes / total[:, None]
-    weight = np.minimum(total / options.full_votes, 1.0) * known
-    log_votes = options.vote_exponent * np.log(shares + options.vote_floor)
+    weight = np.minimum(total / constants.FULL_VOTES, 1.0) * known
+    log_votes = constants.VOTE_EXPONENT * np.log(shares + constants.VOTE_FLOOR)
     answers = softmax(log_votes)
-    whitened = whiten(features, weight, options.feature_components)
-    for _ in range(options.rounds):
-        within = within_covariance(whitened, answers, weight, options.shrinkage)
+    whitened = whiten(features, weight, constants.FEATURE_COMPONENTS)
+    for _ in range(constants.ROUNDS):
+        within = within_covariance(whitened, answers, weight, constants.SHRINKAGE)
         values, axes = np.linalg.eigh(within)
         within = axes @ np.diag(values.clip(0.02, 0.98)) @ axes.T
         between = np.eye(len(values)) - within
@@ -29,7 +31,7 @@ def classified(votes, features, options, *, known):
                 scores[k, c] = log_normal(whitened[k], mean, within + spread)
             if not known[k]:
                 scores[k] = 0
-        answers = softmax(log_votes + options.feature_exponent * scores)
+        answers = softmax(log_votes + constants.FEATURE_EXPONENT * scores)
     return answers
 
 

@@ -1,15 +1,13 @@
 """Objects get the class of their votes and of what they look like."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
 
 from splatseg.core import Labels
 from splatseg.errors import InputError, RangeError, ShapeError
+from splatseg.methods.object_classes import classify
 from splatseg.methods.object_classes.classify import (
-    ObjectClassOptions,
     PooledObjects,
     classify_objects,
     heterogeneity,
@@ -32,6 +30,19 @@ def pooled(votes, features, known=None) -> PooledObjects:
     )
 
 
+def classified_with(objects: PooledObjects, **constants) -> torch.Tensor:
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in constants.items():
+            patch.setattr(classify, name, value)
+        return classify_objects(objects)
+
+
+def categories_after(rounds: int, pooled: PooledObjects, taken) -> PooledObjects:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(classify, "CATEGORY_ROUNDS", rounds)
+        return with_categories(pooled, taken)
+
+
 def random_objects(count=14, classes=4, channels=6, seed=2) -> PooledObjects:
     rng = np.random.default_rng(seed)
     true = rng.integers(classes, size=count)
@@ -47,26 +58,29 @@ def random_objects(count=14, classes=4, channels=6, seed=2) -> PooledObjects:
     "change",
     [
         {},
-        {"vote_exponent": 4.0},
-        {"feature_exponent": 0.6},
-        {"vote_floor": 0.2},
-        {"feature_components": 2},
-        {"shrinkage": 0.6},
-        {"full_votes": 300.0},
-        {"rounds": 1},
+        {"VOTE_EXPONENT": 4.0},
+        {"FEATURE_EXPONENT": 0.6},
+        {"VOTE_FLOOR": 0.2},
+        {"FEATURE_COMPONENTS": 2},
+        {"SHRINKAGE": 0.6},
+        {"FULL_VOTES": 300.0},
+        {"ROUNDS": 1},
     ],
 )
-def test_as_the_equations_say(change) -> None:
-    """Against loops; each option makes a difference."""
-    objects, usual = random_objects(), ObjectClassOptions(rounds=3, feature_exponent=0.3)
-    options = replace(usual, **change)
-    found = classify_objects(objects, options=options)
+def test_as_the_equations_say(change, monkeypatch) -> None:
+    """Against loops; each constant makes a difference."""
+    objects, constants = random_objects(), {"ROUNDS": 3, "FEATURE_EXPONENT": 0.3}
+    usual = classified_with(objects, **constants)
+    constants |= change
+    found = classified_with(objects, **constants)
+    for name, value in constants.items():
+        monkeypatch.setattr(classify, name, value)
     expected = classified(
-        objects.votes.numpy(), objects.features.numpy(), options, known=objects.known.numpy()
+        objects.votes.numpy(), objects.features.numpy(), known=objects.known.numpy()
     )
     np.testing.assert_allclose(found.numpy(), expected, rtol=0, atol=1e-9)
     if change:
-        assert not torch.allclose(found, classify_objects(objects, options=usual), atol=1e-6)
+        assert not torch.allclose(found, usual, atol=1e-6)
 
 
 def alike(seed=0):
@@ -85,8 +99,7 @@ def test_most_views_may_be_wrong_about_an_object_that_looks_like_others() -> Non
     assert int(votes[5].argmax()) == 1
     found = classify_objects(pooled(votes, features))
     assert found.argmax(dim=1).tolist() == [0] * 12 + [1] * 12
-    by_votes = ObjectClassOptions(feature_exponent=0)
-    alone = classify_objects(pooled(votes, features), options=by_votes)
+    alone = classified_with(pooled(votes, features), FEATURE_EXPONENT=0.0)
     assert int(alone[5].argmax()) == 1
 
 
@@ -116,9 +129,7 @@ def test_without_votes_there_is_no_answer_and_without_features_votes_decide() ->
 def test_features_that_say_nothing_change_nothing() -> None:
     votes, _ = alike()
     found = classify_objects(pooled(votes, np.ones((24, 4))))
-    alone = classify_objects(
-        pooled(votes, np.ones((24, 4))), options=ObjectClassOptions(feature_exponent=0)
-    )
+    alone = classified_with(pooled(votes, np.ones((24, 4))), FEATURE_EXPONENT=0.0)
     assert torch.equal(found, alone)
     one = classify_objects(pooled([[3.0, 1.0]], [[1.0, 2.0]]))
     assert int(one[0].argmax()) == 0
@@ -138,29 +149,6 @@ def test_bits_do_not_depend_on_threads() -> None:
     assert torch.equal(*found)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"vote_exponent": -1.0}, "vote_exponent: expected 0 or more"),
-        ({"feature_exponent": float("nan")}, "feature_exponent: expected 0 or more"),
-        ({"full_votes": -1.0}, "full_votes: expected 0 or more"),
-        ({"vote_floor": 0.0}, "vote_floor: expected above 0"),
-        ({"shrinkage": 1.5}, "shrinkage"),
-        ({"feature_components": 0}, "feature_components: expected at least 1"),
-        ({"rounds": 0}, "rounds: expected at least 1"),
-        ({"category_rounds": 0}, "category_rounds: expected at least 1"),
-    ],
-)
-def test_options_out_of_range_are_refused(change, message) -> None:
-    with pytest.raises(RangeError, match=message):
-        ObjectClassOptions(**change)
-
-
-def test_rows_must_be_of_the_same_objects() -> None:
-    with pytest.raises(ShapeError, match="expected 2 rows of 2 votes"):
-        replace(pooled(np.ones((2, 2)), np.ones((2, 3))), features=torch.ones(3, 3).double())
-
-
 def objects(votes: list[list[float]], classes: list[int]) -> PooledObjects:
     count = len(votes)
     return PooledObjects(
@@ -175,7 +163,7 @@ def objects(votes: list[list[float]], classes: list[int]) -> PooledObjects:
 def test_one_round_gives_every_object_all_that_its_tracks_were_taken_for() -> None:
     pooled = objects([[0, 2, 3], [1, 3, 3]], [2, 4, 9])
     taken = {4: {1: 3.0, 6: 1.0}, 9: {6: 2.0}, 2: {1: 0.0}, 77: {5: 1.0}}
-    found = with_categories(pooled, taken, rounds=1)
+    found = categories_after(1, pooled, taken)
     assert found.classes.tolist() == [1, 5, 6]
     # Nothing is known of track 2: its vote for the second object is none.
     expected = [[1.5, 0, 0.5 + 3], [2.25, 0, 0.75 + 3]]
@@ -187,7 +175,7 @@ def test_a_second_round_by_hand() -> None:
     # Track 4 covers both objects alike and was taken for 1 and 6 alike; track 9 is of object 1
     # alone. After a round object 0 is (1/2, 1/2) and object 1 (1/4, 3/4).
     pooled = objects([[4, 0], [4, 4]], [4, 9])
-    found = with_categories(pooled, {4: {1: 1.0, 6: 1.0}, 9: {6: 5.0}}, rounds=2)
+    found = categories_after(2, pooled, {4: {1: 1.0, 6: 1.0}, 9: {6: 5.0}})
     # Expected of track 4: 4 (1/2 + 1/4) = 3 and 5, taken 4 and 4; of track 9: 1 and 3, taken 0, 4.
     first = [1 / 2 * 4 * 4 / 3, 1 / 2 * 4 * 4 / 5]
     second = [1 / 4 * 4 * 4 / 3, 3 / 4 * (4 * 4 / 5 + 4 * 4 / 3)]
@@ -200,11 +188,11 @@ def test_a_track_that_moved_on_is_told_apart_by_the_tracks_beside_it() -> None:
     # the tracks say that object 0 is 3 and object 1 is 8.
     pooled = objects([[50, 10, 0], [50, 0, 10]], [0, 1, 2])
     taken = {0: {3: 52.0, 8: 48.0}, 1: {3: 9.0, 8: 1.0}, 2: {8: 5.5, 3: 4.5}}
-    once = with_categories(pooled, taken, rounds=1).votes
+    once = categories_after(1, pooled, taken).votes
     found = with_categories(pooled, taken).votes
     assert once.argmax(dim=1).tolist() == [0, 0]
     assert found.argmax(dim=1).tolist() == [0, 1]
-    many = with_categories(pooled, taken, rounds=200).votes
+    many = categories_after(200, pooled, taken).votes
     assert many.amax(dim=1).tolist() > found.amax(dim=1).tolist()
     # Votes are only divided anew.
     torch.testing.assert_close(found.sum(dim=1), pooled.votes.sum(dim=1))
@@ -218,7 +206,7 @@ def test_likelihood_does_not_fall() -> None:
     mass = share / share.sum(dim=1, keepdim=True) * pooled.votes.sum(dim=0)[:, None]
     last = -float("inf")
     for rounds in (1, 2, 3, 10, 40):
-        votes = with_categories(pooled, taken, rounds=rounds).votes
+        votes = categories_after(rounds, pooled, taken).votes
         answers = votes / votes.sum(dim=1, keepdim=True)
         now = float((mass * torch.log(pooled.votes.T @ answers)).sum())
         assert now > last
@@ -237,8 +225,6 @@ def test_what_is_wrong_is_refused() -> None:
     pooled = objects([[2.0]], [4])
     with pytest.raises(RangeError, match="0 or more of id 4, got -1"):
         with_categories(pooled, {4: {1: -1.0}})
-    with pytest.raises(RangeError, match="rounds: expected at least 1, got 0"):
-        with_categories(pooled, {4: {1: 1.0}}, rounds=0)
 
 
 def soft(candidates, shares, evidence) -> Labels:

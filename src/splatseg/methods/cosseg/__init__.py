@@ -20,6 +20,7 @@ References:
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 from splatseg.core import InstanceTree, Labels, LabelSource, Layer
 from splatseg.io.evidence import TrackedEvidence
@@ -95,7 +96,7 @@ def run(inputs: MethodInputs, options: CossegOptions) -> Layer | Refined:
     """Train the decoder and read it, as the options say."""
     linked = linked_labels(inputs)
     scene = inputs.gaussians, inputs.views, linked.source
-    given = {
+    given: dict[str, Any] = {
         "features": inputs.features("features"),
         "options": options,
         "classes": inputs.label_names,

@@ -14,6 +14,7 @@ In what their networks differ is a `RandlaVariant`; orders are undone by
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -247,7 +248,7 @@ def _config(table: TensorTable, layout: Layout, path: Path) -> RandlaConfig:
     first, inputs = table.matrix_shape(f"{layout.start}.weight")
     with made_from(path):
         return RandlaConfig(
-            inputs=inputs,
+            inputs=cast("Any", inputs),
             first_width=first,
             widths=tuple(widths),
             ratios=_RATIOS.get(len(widths), (4,) * len(widths)),
