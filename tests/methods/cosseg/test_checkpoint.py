@@ -204,13 +204,16 @@ def about(metadata: dict[str, str], path: str, value: Any) -> None:
         (lambda m: m.pop("about"), "about: expected JSON"),
         (lambda m: about(m, "part", "decoder"), "about: expected encoder or network, got 'deco"),
         (lambda m: about(m, "config", 3), "about: expected objects config and recipe"),
-        (lambda m: about(m, "config.inputs", 4), "config: inputs: expected 3 or 6 channels, got 4"),
+        (lambda m: about(m, "config.inputs", 4), "config: inputs: expected one of 3, 6, got 4"),
         (lambda m: about(m, "config.widths", "ab"), "config: widths"),
         (lambda m: about(m, "config.classes", 1e40), "config: classes: expected finite numbers"),
         (lambda m: about(m, "config.other", 1), "config: expected classes, first_width"),
         (lambda m: about(m, "config.variant.slope", 7), "variant: slope: expected a value in"),
         (lambda m: about(m, "inputs", None), "inputs: expected colour_range, grid_size, origin"),
-        (lambda m: about(m, "inputs.grid_size", -1), "inputs: grid_size: expected above 0"),
+        (
+            lambda m: about(m, "inputs.grid_size", -1),
+            "inputs: grid_size: expected a value in (0, 1000]",
+        ),
         (
             lambda m: m.update(format="x"),
             "expected a RandLA-Net of splatseg, or tensors of a known",
@@ -345,7 +348,7 @@ LAYER = "encoder.1.lse1.mlp.conv.weight"
         ),
         (
             lambda s: s.update({"fc0.weight": torch.zeros(8, 4)}),
-            "inputs: expected 3 or 6 channels, got 4.",
+            "inputs: expected one of 3, 6, got 4.",
         ),
         (lambda s: s.pop("fc0.weight"), "expected a RandLA-Net of splatseg, or tensors of a known"),
         (lambda s: s.clear(), "expected tensors by name or a state_dict, got none."),

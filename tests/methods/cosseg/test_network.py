@@ -238,18 +238,18 @@ def test_what_does_not_fit() -> None:
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"inputs": 4}, "inputs: expected 3 or 6 channels, got 4"),
-        ({"first_width": 0}, "first_width: expected 1 to 4096, got 0"),
+        ({"inputs": 4}, "inputs: expected one of 3, 6, got 4"),
+        ({"first_width": 0}, r"first_width: expected a value in \[1, 4096\], got 0"),
         ({"widths": ()}, "widths: expected 1 to 12 levels, got 0"),
-        ({"widths": (4, 5), "ratios": (2, 2)}, "widths: expected even numbers to 4096, got 5"),
+        ({"widths": (4, 5), "ratios": (2, 2)}, "widths: expected even numbers"),
         ({"ratios": (2,)}, "ratios: expected 5, one a level, got 1"),
-        ({"ratios": (4, 4, 4, 4, 0)}, "ratios: expected 1 to 4096"),
-        ({"neighbours": 0}, "neighbours: expected 1 to 4096, got 0"),
-        ({"classes": 0}, "classes: expected 1 to 4096, got 0"),
+        ({"ratios": (4, 4, 4, 4, 0)}, r"ratios\[4\]: expected a value in \[1, 4096\]"),
+        ({"neighbours": 0}, r"neighbours: expected a value in \[1, 4096\], got 0"),
+        ({"classes": 0}, r"classes: expected a value in \[1, 4096\], got 0"),
     ],
 )
 def test_wrong_shapes(fields: dict, message: str) -> None:
-    with pytest.raises(RangeError, match=message):
+    with pytest.raises(InputError, match=message):
         RandlaConfig(**fields)
 
 
@@ -258,7 +258,7 @@ def test_wrong_shapes(fields: dict, message: str) -> None:
     [
         ({"distance": "manhattan"}, "distance: expected one of euclidean, squared"),
         ({"slope": -0.1}, r"slope: expected a value in \[0, 1\], got -0.1"),
-        ({"epsilon": 0.0}, r"epsilon: expected a value in \(0, 1\), got 0.0"),
+        ({"epsilon": 0.0}, r"epsilon: expected a value in \(0, 1\), got 0"),
     ],
 )
 def test_wrong_variants(fields: dict, message: str) -> None:

@@ -13,8 +13,8 @@ stand for themselves. Unprojection onto Gaussians is
 .. math:: f_{n,i} = \frac{\sum_{views} \sum_p w_{pi}\, f_n(p)}{\sum_{views} \sum_p w_{pi}},
 
 or as published, equation 2, divided by the number of pixels in which the Gaussian takes part, and
-scaled so that the mean square of all Gaussians is that of vectors of length 1. As it is printed the
-sum is not divided; then it is as large as its Gaussian is seen.
+scaled so that the mean square of all Gaussians is that of vectors of length 1. (As it is printed
+the sum is not divided; then it would be as large as its Gaussian is seen.)
 
 References:
     Dou et al., CoSSegGaussians (2024), sections 3.2 and 4.1, "Multi-scale Features Setup", eq. 2.
