@@ -22,7 +22,8 @@ from scored import ScoredScene
 from splatseg.core import Features, InstanceTree, Labels
 from splatseg.io.layers import load_layer
 from splatseg.io.scene import load_scene
-from splatseg.lift import DecomposeOptions, complete, decompose
+from splatseg.lift import complete
+from splatseg.methods.saga.decomposition import DecomposeOptions, decompose
 
 CUTS = ("group", "object", "part")
 

@@ -18,13 +18,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from splatseg.lift.point_network import (
-    PUBLISHED_S3DIS,
-    PyramidOptions,
-    RandlaEncoder,
-    point_pyramid,
-)
-from splatseg.lift.point_network.block import sample
+from splatseg.methods.cosseg.network import RandlaEncoder, sample
+from splatseg.methods.cosseg.pyramid import PUBLISHED_S3DIS, PyramidOptions, point_pyramid
 from splatseg.render.cpu import set_threads
 
 

@@ -60,13 +60,8 @@ from splatseg.io.captures import read_capture
 from splatseg.io.scans import read_scans
 from splatseg.io.scene import load_scene
 from splatseg.lift import GaussianField, PointLabelOptions
-from splatseg.lift.points import (
-    RegionOptions,
-    ViewedPointOptions,
-    ViewedPoints,
-    points_in_sight,
-    region_labels,
-)
+from splatseg.lift.point_regions import region_labels
+from splatseg.lift.viewed_points import ViewedPointOptions, ViewedPoints, points_in_sight
 from splatseg.methods import find_method
 from splatseg.neighbours import NeighbourIndex
 from splatseg.street.field import MeshField
@@ -110,7 +105,7 @@ class Region:
             self._labels.ids,
             points,
             weights=self._labels.evidence if self._fair else None,
-            options=RegionOptions(radius=self._bench.radius),
+            radius=self._bench.radius,
         )
 
 

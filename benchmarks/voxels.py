@@ -31,45 +31,24 @@ from word_scene import WordScene
 from splatseg.core import FeatureMap, VoxelFeatures, VoxelGrid
 from splatseg.io.scene import load_scene
 from splatseg.lift.vocabulary import Vocabulary
-from splatseg.lift.voxels import (
-    AssignmentOptions,
-    FilterOptions,
-    HitOptions,
-    VoxelWords,
-    assign_voxels,
-    lift_to_voxels,
-    store,
-    surface_gaussians,
-    surface_points,
-    voxelise_to_count,
-)
-from splatseg.lift.voxels.lifting import HitRule
 from splatseg.methods.voxels import PUBLISHED, VoxelOptions
+from splatseg.methods.voxels.grid import nearest_voxels, surface_gaussians, voxelise_to_count
+from splatseg.methods.voxels.lifting import HitRule, lift_to_voxels
+from splatseg.methods.voxels.words import VoxelWords, store
 from splatseg.tasks import SegmentOptions, segment
 
 _CHANNELS, _VOXELS = 512, 100_000
 _DEFAULT = VoxelOptions()
-_ALL = FilterOptions(opaque_share=1.0, min_opacity=None, max_elongation=None, scale_share=None,
-                     min_neighbours=0)  # fmt: skip
-_RAYS = replace(_DEFAULT, cells="depth", projection=HitOptions(hits="first"))
 SETTINGS = {
     "default": _DEFAULT,
     "published": PUBLISHED,
-    "published, not filtered": replace(PUBLISHED, filtering=_ALL),
-    "cells of depth": replace(_DEFAULT, cells="depth"),
-    "cells of depth, first hit": _RAYS,
-    "cells of depth, several hits": replace(_RAYS, projection=HitOptions(hits="several")),
-    "first hit": replace(_DEFAULT, projection=HitOptions(hits="first")),
-    "several hits": replace(_DEFAULT, projection=HitOptions(hits="several")),
-    "means of views": replace(_DEFAULT, projection=HitOptions(hits="weights", average="views")),
-    "trilinear": replace(_DEFAULT, assignment=AssignmentOptions(interpolation="trilinear")),
-    "4 cells at most": replace(_DEFAULT, assignment=AssignmentOptions(max_distance=4.0)),
+    "first hit": replace(_DEFAULT, hits="first"),
+    "weights": replace(_DEFAULT, hits="weights"),
     "50 000": replace(_DEFAULT, voxels=50_000),
     "100 000": replace(_DEFAULT, voxels=100_000),
     "float32": replace(_DEFAULT, precision="float32"),
     "int8": replace(_DEFAULT, precision="int8"),
-    "product, 12 bytes": replace(_DEFAULT, precision="product", parts=12),
-    "product, 6 bytes": replace(_DEFAULT, precision="product", parts=6),
+    "product, 64 bytes": replace(_DEFAULT, precision="product"),
 }
 
 
@@ -121,12 +100,9 @@ def _lifting(bench: WordScene, stride: int, hits: HitRule) -> None:
     gaussians = bench.scene.gaussians
     kept = surface_gaussians(gaussians)
     grid = voxelise_to_count(gaussians.means.detach()[kept], _VOXELS)
-    nearest = assign_voxels(grid, gaussians.means.detach()).rows[:, 0].long()
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     began = time.perf_counter()
-    lifted = lift_to_voxels(
-        grid, views, maps, options=HitOptions(hits=hits), gaussians=gaussians, rows=nearest
-    )
+    lifted = lift_to_voxels(grid, views, maps, gaussians, hits=hits)
     seconds = time.perf_counter() - began
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     print(
@@ -151,9 +127,9 @@ def dense(bench: WordScene) -> None:
 def asking(bench: WordScene) -> None:
     words = bench.vocabulary
     space = words.space
-    points = surface_points(bench.scene.gaussians, bench.scene.train_views, stride=4)
-    grid: VoxelGrid = voxelise_to_count(points, _VOXELS)
-    rows = assign_voxels(grid, bench.scene.gaussians.means.detach()).rows
+    means = bench.scene.gaussians.means.detach()
+    grid: VoxelGrid = voxelise_to_count(means, _VOXELS)
+    rows = nearest_voxels(grid, means).int()[:, None]
     generator = torch.Generator().manual_seed(0)
     values = torch.randn(len(grid), _CHANNELS, generator=generator)
     layer = VoxelFeatures(

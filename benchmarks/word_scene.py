@@ -19,8 +19,8 @@ from splatseg.io.scene import load_scene_layer
 from splatseg.lift import complete
 from splatseg.lift.label_maps import label_map
 from splatseg.lift.vocabulary import Vocabulary
-from splatseg.lift.voxels import VoxelWords
 from splatseg.lift.words import WordIndex
+from splatseg.methods.voxels.words import VoxelWords
 from splatseg.tasks import QueryOptions, QuerySession
 
 PAPER_CLASSES = (

@@ -39,7 +39,7 @@ from word_scene import WordScene
 from splatseg.core.voxels import StoredTable
 from splatseg.io.scene import load_scene
 from splatseg.lift.relevancy import TextSpace
-from splatseg.lift.voxels import TableWords, store
+from splatseg.methods.voxels.words import TableWords, store
 
 _CHUNK = 16_384
 _SAMPLE = 32_768

@@ -29,7 +29,7 @@ from scored import run_rows
 from word_scene import PAPER_CLASSES, WordScene
 
 from splatseg.core import Features
-from splatseg.lift.voxels import VoxelWords
+from splatseg.methods.voxels.words import VoxelWords
 
 
 def _calibrated(

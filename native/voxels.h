@@ -2,7 +2,7 @@
 //
 // Positions are in cells: cell (x, y, z) is the box from (x, y, z) to (x + 1, y + 1, z + 1). Cells
 // lie in bricks of 8 x 8 x 8 that an open hash table finds by their coordinates, so that rays cross
-// an empty brick in one step. The readable twin is lift/voxels/reference.py.
+// an empty brick in one step. The readable twin is tests/methods/voxels/reference.py.
 #pragma once
 
 #include <cstdint>

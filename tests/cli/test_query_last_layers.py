@@ -13,7 +13,7 @@ from splatseg.errors import InputError
 from splatseg.io.evidence import open_evidence
 from splatseg.io.scene import load_scene, load_scene_layer
 from splatseg.lift.vocabulary import vocabulary_of
-from splatseg.lift.voxels import VoxelWords
+from splatseg.methods.voxels.words import VoxelWords
 from splatseg.models import LoadOptions, find_model
 from splatseg.models.lseg import LSegOptions
 from splatseg.tasks import QueryOptions, QuerySession
@@ -47,7 +47,7 @@ def voxels(small, weights, splatseg) -> VoxelFeatures:
     )  # fmt: skip
     assert status == 0, err
     assert out.startswith("features of 3 views by lseg, ")
-    few = ("--voxels", "40", "--min-points", "1")  # of pictures of some hundred pixels
+    few = ("--voxels", "40")  # of pictures of some hundred pixels
     for method, more in (("voxels", few), ("features", ())):
         words = ("segment", small.scene, "--method", method, "--evidence", "decoded")
         status, _, err = splatseg(*words, "--layer", method, *more)

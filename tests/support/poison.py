@@ -15,7 +15,6 @@ from splatseg.io.evidence import TextEmbeddings
 from splatseg.lift import GaussianField
 from splatseg.neighbours import NeighbourIndex
 from splatseg.prompting.prompts import AxisBox
-from support.poison_points import of_points
 
 COUNT, WIDTH, HEIGHT = 6, 12, 9
 
@@ -309,7 +308,6 @@ def special(world: World, by_type: dict[type, Any]) -> dict[str, Any]:
     byte = torch.zeros(HEIGHT, WIDTH, 3, dtype=torch.uint8)
     return {
         **inner(world, by_type),
-        **of_points(world.folder),
         "tasks.select.prompts": [AxisBox(low=(-9, -9, -9), high=(9, 9, 9))],
         "tasks.draw_answers.answers": answers(),
         "tasks.draw_heat.answers": answers(),

@@ -20,7 +20,6 @@ PACKAGES = (
     "io.images",
     "lift",
     "lift.training",
-    "lift.point_network",
     "methods",
     "models",
     "models.classical",

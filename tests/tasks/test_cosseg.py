@@ -8,16 +8,12 @@ import torch
 
 from splatseg.cli import main
 from splatseg.core import Features, Labels
-from splatseg.errors import InputError
 from splatseg.io.evidence import open_evidence
 from splatseg.io.scene import load_scene, load_scene_layer
-from splatseg.lift.point_network import (
-    PointInputs,
-    RandlaConfig,
-    RandlaEncoder,
-    save_point_encoder,
-)
 from splatseg.methods.cosseg import CossegOptions
+from splatseg.methods.cosseg.checkpoint import save_point_encoder
+from splatseg.methods.cosseg.network import RandlaEncoder
+from splatseg.methods.cosseg.pyramid import PointInputs, RandlaConfig
 from splatseg.tasks.segment import segment
 from splatseg.tasks.segment_options import SegmentOptions
 from support.checkpoints import saved
@@ -152,12 +148,5 @@ def test_a_decoder_of_segments_has_ids_that_mean_the_same_in_all_views(scene) ->
     assert {id for id in layer.ids.tolist() if id >= 0} <= given
     assert set(layer.info.class_of) <= given
     assert layer.info.class_of
-    linked = decoded(scene, "labels_tracked", link="associate")
-    assert linked.info.class_of
-    assert linked.info.names != layer.info.names
     panoptic = decoded(scene, "labels_panoptic")
     assert panoptic.info.class_of
-    with pytest.raises(InputError, match="link: expected associate, since ids of panoptic"):
-        decoded(scene, "labels_panoptic", link="given")
-    with pytest.raises(InputError, match="link: expected segments of objects .panoptic, tracked"):
-        decoded(scene, "labels_semantic", link="associate")

@@ -169,16 +169,10 @@ def test_a_higher_probability_is_asked_for(scene, layers, words) -> None:
     assert query(scene, words[:1], options=above, layers=layers).unknown == (words[0],)
 
 
-def test_components_and_answers_count(scene, layers, words) -> None:
+def test_components_count(scene, layers, words) -> None:
     base = query(scene, words, layers=layers)
     one = query(scene, words, options=QueryOptions(components=1), layers=layers)
     assert not torch.equal(one.cosines, base.cosines)
-    from splatseg.lift.words import AnswerOptions
-
-    warm = QueryOptions(answers=AnswerOptions(temperature=3.0))
-    assert not torch.equal(
-        query(scene, words, options=warm, layers=layers).probabilities, base.probabilities
-    )
 
 
 def test_features_of_each_gaussian_answer_in_connected_pieces(

@@ -29,7 +29,7 @@ def run(capsys, *words: object) -> tuple[int, str]:
     return status, output.out + output.err
 
 
-QUICK = ("--steps", 6, "--batch", 200, "--pixels", 200, "--held-out", 0, "--views", "train")
+QUICK = ("--steps", 6, "--batch", 200, "--held-out", 0, "--views", "train")
 
 
 def test_features_of_a_second_evidence_guide_the_masks(scene, capsys) -> None:
@@ -63,7 +63,7 @@ def test_features_of_a_second_evidence_guide_the_masks(scene, capsys) -> None:
 def test_the_published_setting_is_guided_by_what_is_at_hand(scene, capsys) -> None:
     """The features that are taken are said and recorded; selections follow the paper."""
     asked = ("segment", scene, "--method", "saga", "--evidence", "masks_sam", "--backend", "cpu")
-    few = ("--published", "--steps", 3, "--grid", 12, "--pixels", 144, "--batch", 144)
+    few = ("--published", "--steps", 3, "--grid", 12)
     status, said = run(capsys, *asked, *few, "--layer", "paper")
     assert status == 0, said
     assert "guidance: features_dino, of " in said

@@ -12,9 +12,9 @@ from splatseg.core import Features, InstanceTree
 from splatseg.errors import InputError
 from splatseg.io.layers import load_layer
 from splatseg.io.scene import load_scene
-from splatseg.lift import DecomposeOptions, decompose
 from splatseg.methods import find_method
 from splatseg.methods.saga import SagaOptions
+from splatseg.methods.saga.decomposition import DecomposeOptions, decompose
 from splatseg.tasks import SegmentOptions, segment
 
 
@@ -24,9 +24,9 @@ def run(capsys, *words: object) -> tuple[int, str]:
     return status, output.out + output.err
 
 
-TRAINING = {"steps": 6, "batch": 200, "pixels": 200, "held_out": 0.0}
+TRAINING = {"steps": 6, "batch": 200, "held_out": 0.0}
 QUICK = [f"--{name.replace('_', '-')}={value}" for name, value in TRAINING.items()]
-LOOSE = ["--object-increase", 0.02, "--part-sample", 50]
+LOOSE = ["--object-increase", 0.02, "--part-increase", 0.05]
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +52,7 @@ def test_a_layer_of_features_is_decomposed_without_training(scene, capsys) -> No
     assert tree.info.views == features.info.views
     own = decompose(
         load_scene(scene).gaussians, features,
-        options=DecomposeOptions(object_increase=0.02, part_sample=50),
+        options=DecomposeOptions(object_increase=0.02, part_increase=0.05),
     )  # fmt: skip
     assert own.nodes == tree.nodes
     assert torch.equal(own.labels.ids, tree.labels.ids)

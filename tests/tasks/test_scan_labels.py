@@ -12,7 +12,7 @@ from splatseg.core import Gaussians, Labels, LayerInfo, PointLabels, ScanSource,
 from splatseg.errors import InputError
 from splatseg.io.captures import read_capture
 from splatseg.io.scans import read_scans
-from splatseg.lift.points import ViewedPointOptions
+from splatseg.lift.viewed_points import ViewedPointOptions
 from splatseg.street.field import MeshField
 from splatseg.tasks import ScanLabelOptions, label_scans, viewed_points
 from support.analytic import BALL, FLOOR, BallOverFloor
@@ -146,7 +146,7 @@ def test_gaussians_label_points_by_what_views_show(labelled, generated_drive, tm
     # What is shaped alike is called alike: nothing is left out, and options count.
     again = label_scans(
         scene, generated_drive, tmp_path / "more", layers={"classes": layer}, backend="cpu",
-        points=ViewedPointOptions(trees=4),
+        points=ViewedPointOptions(window=64),
     )  # fmt: skip
     assert again.counts.unlabelled == 0 < made.counts.unlabelled
 

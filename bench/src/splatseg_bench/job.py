@@ -22,9 +22,9 @@ from splatseg.io.evidence import FeatureEvidence, open_evidence
 from splatseg.lift import GaussianField
 from splatseg.lift.affinity import KIND
 from splatseg.lift.vocabulary import Vocabulary, vocabulary_of
-from splatseg.lift.voxels import VoxelWords
 from splatseg.lift.words import WordIndex
 from splatseg.methods import Method
+from splatseg.methods.voxels.words import VoxelWords
 from splatseg.prompting.prompts import ViewPrompt
 from splatseg.render import BackendName
 from splatseg.tasks._observer import Observer

@@ -27,7 +27,7 @@ from splatseg.io.arrays import save_arrays
 from splatseg.io.atomic import atomic_file, path_inside
 from splatseg.io.evidence import open_evidence
 from splatseg.lift import GaussianField
-from splatseg.lift.points import RegionOptions, region_labels
+from splatseg.lift.point_regions import region_labels
 from splatseg.methods import Method
 from splatseg.street.build import METHOD_NAME
 from splatseg.street.field import MeshField
@@ -255,7 +255,7 @@ class Drive:
             labels.ids,
             points,
             weights=_seen_weights(labels) if rule == "fair" else None,
-            options=RegionOptions(radius=self._switches.radius / unit),
+            radius=self._switches.radius / unit,
         )
 
     @cached_property

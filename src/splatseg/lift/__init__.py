@@ -14,8 +14,6 @@ from splatseg.lift.boundaries.sharpen import sharpen as sharpen
 from splatseg.lift.boundaries.split import split as split
 from splatseg.lift.completion.complete import CompletionOptions as CompletionOptions
 from splatseg.lift.completion.complete import complete as complete
-from splatseg.lift.decomposition.decompose import decompose as decompose
-from splatseg.lift.decomposition.options import DecomposeOptions as DecomposeOptions
 from splatseg.lift.field import GaussianField as GaussianField
 from splatseg.lift.field import GaussianView as GaussianView
 from splatseg.lift.field_layers import Readout as Readout

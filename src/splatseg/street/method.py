@@ -22,7 +22,7 @@ from splatseg.core import UNLABELLED, Gaussians, Labels, ScanSource, View
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, RangeError
 from splatseg.lift import GaussianField
-from splatseg.lift.points.thin import thin
+from splatseg.lift.point_shapes import thin
 from splatseg.methods import Method, MethodInputs
 from splatseg.street.build import (
     METHOD_NAME,

@@ -12,7 +12,7 @@ from splatseg._check import check_finite, check_shape
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError, RangeError
-from splatseg.lift.points.thin import thin
+from splatseg.lift.point_shapes import thin
 from splatseg.street.shapes import (
     FACES,
     VERTICES,

@@ -14,8 +14,8 @@ from splatseg.core.json_values import is_json_number, plain_object
 from splatseg.errors import FileFormatError, InputError, MissingFileError, quoted
 from splatseg.io.foreign import is_file, made_from
 from splatseg.io.json_files import json_text, parse_object
+from splatseg.io.tensor_table import TensorTable
 from splatseg.io.tensors import read_safetensors, read_tensors, read_torch_file, write_tensors
-from splatseg.lift.point_network.tensor_table import TensorTable
 from splatseg.street.shapes import (
     MAX_LAYERS,
     PUBLISHED,

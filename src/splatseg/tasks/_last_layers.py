@@ -14,7 +14,7 @@ from splatseg.core import Features
 from splatseg.core.models import LateTextFeatures, TextFeatures
 from splatseg.errors import InputError, quoted
 from splatseg.io.evidence import TEXT_FILE, FeatureEvidence, evidence_header
-from splatseg.lift.voxels import LastLayers
+from splatseg.methods.voxels.words import LastLayers
 
 _AT_ONCE = 8192
 """Rows that are widened at a time."""

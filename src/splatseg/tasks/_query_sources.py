@@ -15,8 +15,8 @@ from splatseg.io.evidence import (
 )
 from splatseg.io.scene import scene_layer_names
 from splatseg.lift.vocabulary import Vocabulary, vocabulary_of
-from splatseg.lift.voxels import LastLayers
 from splatseg.methods import find_method
+from splatseg.methods.voxels.words import LastLayers
 from splatseg.render import BackendName
 from splatseg.tasks._last_layers import in_word_space, last_layers
 from splatseg.tasks._observer import Observer

@@ -22,8 +22,9 @@ from splatseg.core import (
 from splatseg.core.boundary import boundary
 from splatseg.core.models import TextFeatures
 from splatseg.errors import InputError
-from splatseg.lift.voxels import VoxelWords
-from splatseg.lift.words import ThingLooks, WordAnswers, WordIndex, answer_phrases, thing_looks
+from splatseg.lift.phrases import ThingLooks, answer_phrases, thing_looks
+from splatseg.lift.words import WordAnswers, WordIndex
+from splatseg.methods.voxels.words import VoxelWords
 from splatseg.render import BackendName
 from splatseg.selection import components
 from splatseg.tasks._observer import SILENT, Observer
@@ -259,7 +260,7 @@ class QuerySession:
         Raises:
             InputError: If there are none, one is there twice, or nothing is known of one.
         """
-        asked = self._in_parts(self._index.ask(words, options=self._options.answers))
+        asked = self._in_parts(self._index.ask(words))
         for word in asked.words:
             if asked.words.count(word) > 1:
                 raise InputError(f"words: expected distinct words, got {word!r} more than once.")
@@ -283,7 +284,7 @@ class QuerySession:
 
     def _in_parts(self, asked: WordAnswers) -> WordAnswers:
         """Phrases asked by their parts, where each vector is a thing."""
-        index, options = self._index, self._options.answers
+        index = self._index
         if (
             self._options.phrases == "whole"
             or self._places is None
@@ -292,15 +293,9 @@ class QuerySession:
             return asked
 
         def of_word(word: str) -> Tensor:
-            return index.ask([word], options=options).probabilities[:, 0]
+            return index.ask([word]).probabilities[:, 0]
 
-        _, probabilities = answer_phrases(
-            asked,
-            lambda: self._looks,
-            index.vocabulary,
-            of_word,
-            temperature=options.temperature,
-        )
+        _, probabilities = answer_phrases(asked, lambda: self._looks, index.vocabulary, of_word)
         return replace(asked, probabilities=probabilities)
 
     @cached_property

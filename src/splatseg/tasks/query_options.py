@@ -1,12 +1,11 @@
 """What a scene is asked for words by."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 from splatseg._check import check_choice, check_range
 from splatseg.core.boundary import convert_fields
 from splatseg.errors import RangeError
-from splatseg.lift.words import AnswerOptions
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,9 +37,6 @@ class QueryOptions:
     phrases: Literal["parts", "whole"] = "parts"
     """How "red mug on the desk" is asked of objects. parts: its name, its colour, and what it is on
     or near count beside its cosine. whole: the cosine alone."""
-
-    answers: AnswerOptions = field(default_factory=AnswerOptions)
-    """How cosines become probabilities."""
 
     def __post_init__(self) -> None:
         convert_fields(self)

@@ -18,7 +18,7 @@ from splatseg.io.export import (
 )
 from splatseg.io.scans import Scans, read_scans
 from splatseg.io.scene import load_scene_layer, scene_layer_names
-from splatseg.lift.points import ViewedPointOptions, ViewedPoints
+from splatseg.lift.viewed_points import ViewedPointOptions, ViewedPoints
 from splatseg.render import BackendName
 from splatseg.street.block_field import DriveField, ScanLabeller
 from splatseg.street.field import MeshField

@@ -8,20 +8,28 @@ import torch
 
 from splatseg.core import Features, LabelMap, View
 from splatseg.core.checkpoints import Checkpoints
-from splatseg.errors import InputError, RangeError, ShapeError
+from splatseg.errors import InputError, ShapeError
 from splatseg.lift.heads import ClassifierHead
-from splatseg.lift.point_network import spatial_features
 from splatseg.methods._trained_labels import TrainingContext
 from splatseg.methods.cosseg import CossegOptions, train_cosseg
-from splatseg.methods.cosseg._decoded_layer import decoded_in_views
+from splatseg.methods.cosseg.features import ReducedBlocks
+from splatseg.methods.cosseg.options import COMPONENTS, HEAD
+from splatseg.methods.cosseg.points import spatial_features
+from splatseg.methods.cosseg.train import decoded_in_views
 
 from .conftest import Blocks, Maps, camera
 
 DRAWN_BY = "auto"  # training is the same on all; what renders is tested in lift
-QUICK = {
-    "steps": 30, "batch": 200, "pixels": 200, "held_out": 0.0, "rate": 0.01,
-    "decoded": (6, 5), "head": (8, 4),
-}  # fmt: skip
+QUICK = {"steps": 30, "batch": 200, "pixels": 200, "held_out": 0.0, "rate": 0.01}
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch):
+    """A small decoder."""
+    monkeypatch.setattr("splatseg.methods.cosseg.options.DECODED", (6, 5))
+    monkeypatch.setattr("splatseg.methods.cosseg.options.PUBLISHED_DECODED", (6, 5))
+    monkeypatch.setattr("splatseg.methods.cosseg.train.HEAD", (8, 4))
+    monkeypatch.setattr("splatseg.methods.cosseg.options.PUBLISHED_DROPOUT", 0.0)
 
 
 def context(**changes) -> TrainingContext:
@@ -51,13 +59,7 @@ def right(halves, features: Features) -> float:
         {"spatial": "none"},
         {"semantic": "none", "steps": 150},
         {"spatial": "first", "semantic": "first"},
-        {"points": "blocks", "block_points": 200},
         {"points": "visible"},
-        {"blend": "features"},
-        {"label_loss": "generalised"},
-        {"weighting": "agreement"},
-        {"transitions": "views"},
-        {"division": "sum"},
     ],
 )
 def test_halves_are_told_apart(halves, encoder_file, change) -> None:
@@ -93,21 +95,7 @@ def replace_evidence(halves, evidence):
         {"semantic": "none"},
         {"spatial": "first"},
         {"spatial": "none"},
-        {"division": "sum"},
-        {"division": "pixels"},
-        {"components": 2},
-        {"lifted_side": 16},
-        {"min_pixels": 110},
         {"points": "visible"},
-        {"points": "blocks", "block_points": 200},
-        {"decoded": (6, 7)},
-        {"head": (4,)},
-        {"blend": "features"},
-        {"label_loss": "generalised"},
-        {"label_loss": "symmetric"},
-        {"label_loss": "bootstrap"},
-        {"weighting": "agreement"},
-        {"transitions": "views"},
         {"rate": 0.02},
         {"steps": 20},
         {"batch": 100},
@@ -126,22 +114,29 @@ def test_each_option_makes_a_difference(halves, encoder_file, change) -> None:
     assert not (same_shape and torch.equal(usual.values, changed.values))
 
 
-def test_block_points_and_transition_rate_make_a_difference(halves, encoder_file) -> None:
-    blocks = {"points": "blocks", "block_points": 200}
-    first = trained(halves, encoder_file, **blocks)
-    second = trained(halves, encoder_file, **blocks | {"block_points": 384})
-    assert not torch.equal(first.values, second.values)
-    first = trained(halves, encoder_file, transitions="views")
-    second = trained(halves, encoder_file, transitions="views", transition_rate=0.1)
-    assert not torch.equal(first.values, second.values)
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("features.COMPONENTS", 2), ("features.LIFTED_SIDE", 16), ("train.HEAD", (4,)),
+     ("options.DECODED", (6, 7))],
+)  # fmt: skip
+def test_each_constant_counts(halves, encoder_file, monkeypatch, name, value) -> None:
+    usual = trained(halves, encoder_file).values
+    monkeypatch.setattr(f"splatseg.methods.cosseg.{name}", value)
+    if name == "features.COMPONENTS":
+        monkeypatch.setattr(ReducedBlocks.__init__, "__kwdefaults__", {"components": value})
+    changed = trained(halves, encoder_file).values
+    assert not (usual.shape == changed.shape and torch.equal(usual, changed))
 
 
-def test_gaussians_in_few_pixels_are_left_to_their_neighbours(halves, encoder_file) -> None:
-    from splatseg.methods.cosseg._distilled import pixel_counts
+def test_gaussians_in_few_pixels_are_left_to_their_neighbours(
+    halves, encoder_file, monkeypatch
+) -> None:
+    from splatseg.methods.cosseg.features import pixel_counts
 
     counts = pixel_counts(halves.gaussians, halves.views, backend=DRAWN_BY)
     least = int(counts.median())
-    features = trained(halves, encoder_file, min_pixels=least)
+    monkeypatch.setattr("splatseg.methods.cosseg.options.PUBLISHED_MIN_PIXELS", least)
+    features = trained(halves, encoder_file, points="visible")
     few = counts < least
     assert features.weights is not None
     assert bool((features.weights[few] == 0).all())
@@ -150,6 +145,9 @@ def test_gaussians_in_few_pixels_are_left_to_their_neighbours(halves, encoder_fi
     labels = ClassifierHead.of(features).labels(features)
     assert bool((labels.ids[few] == -1).all())
     assert bool((labels.ids[~few] != -1).all())
+    monkeypatch.setattr("splatseg.methods.cosseg.options.PUBLISHED_MIN_PIXELS", 10_000)
+    with pytest.raises(InputError, match="at least 10000 pixels, got none of 384"):
+        trained(halves, encoder_file, points="visible")
 
 
 def test_what_was_skipped_and_assumed_is_recorded(halves, encoder_file) -> None:
@@ -215,7 +213,7 @@ def test_what_was_interrupted_goes_on_to_the_same_bits(halves, encoder_file, tmp
     again, resumed = interrupted(halves, encoder_file, tmp_path)
     assert torch.equal(again.values, trained(halves, encoder_file).values)
     with pytest.raises(InputError, match="distilled"):
-        trained(halves, encoder_file, given=resumed, components=2)
+        trained(halves, encoder_file, given=resumed, features=False)
 
 
 def test_points_of_views_lie_in_files_beyond_the_budget(halves, encoder_file) -> None:
@@ -237,7 +235,7 @@ def test_what_views_decode_is_stored_where_they_were_learnt_from(
         found.append(len(points := list(points)))
         return torch.full_like(decoded_in_views(points, *given), 7.0)
 
-    monkeypatch.setattr("splatseg.methods.cosseg._train.decoded_in_views", spied)
+    monkeypatch.setattr("splatseg.methods.cosseg.train.decoded_in_views", spied)
     layer = trained(halves, encoder_file, **VISIBLE | {"steps": 2} | changes)
     assert found == ([] if views is None else [views])
     assert bool((layer.values == 7).all()) == (views is not None)
@@ -248,11 +246,11 @@ def test_views_have_the_coordinates_of_the_scene(halves, encoder_file, monkeypat
     found = []
 
     def spied(*given, **named):
-        made = spatial_features(*given, **named)
-        found.append((given[1].double(), made.pyramid.positions.double()))
-        return made
+        pyramid, levels = spatial_features(*given, **named)
+        found.append((given[1].double(), pyramid.positions.double()))
+        return pyramid, levels
 
-    monkeypatch.setattr("splatseg.methods.cosseg._points.spatial_features", spied)
+    monkeypatch.setattr("splatseg.methods.cosseg.points.spatial_features", spied)
     options = CossegOptions(**QUICK | VISIBLE | {"encoder": encoder_file, "steps": 4})
     moved = [View(name=f"v{x}", camera=camera(x / 2)) for x in (-2, -1, 1, 2)]
     maps = Maps({view.name: LabelMap(ids=halves.ids(view)) for view in moved})
@@ -270,11 +268,11 @@ def test_views_have_the_coordinates_of_the_scene(halves, encoder_file, monkeypat
 VISIBLE = {"points": "visible", "views_per_step": 4}
 
 
-@pytest.mark.parametrize(
-    "change", [{"views_per_step": 2}, {"dropout": 0.5}, {"sampling": "strata"}]
-)
-def test_options_of_a_step_make_a_difference(halves, encoder_file, change) -> None:
+@pytest.mark.parametrize("change", [{"views_per_step": 2}, {}, {"sampling": "strata"}])
+def test_options_of_a_step_make_a_difference(halves, encoder_file, monkeypatch, change) -> None:
     usual = trained(halves, encoder_file, **VISIBLE)
+    if not change:
+        monkeypatch.setattr("splatseg.methods.cosseg.options.PUBLISHED_DROPOUT", 0.5)
     changed = trained(halves, encoder_file, **VISIBLE | change)
     assert not torch.equal(usual.values, changed.values)
 
@@ -292,10 +290,11 @@ def test_a_step_is_of_as_many_views_as_it_says() -> None:
 
 
 def test_what_was_interrupted_under_the_published_setting_goes_on(
-    halves, encoder_file, tmp_path
+    halves, encoder_file, tmp_path, monkeypatch
 ) -> None:
     """With running statistics and drop-out; the layer knows its loss curve."""
-    setting = VISIBLE | {"dropout": 0.5, "blend": "features", "sampling": "strata"}
+    monkeypatch.setattr("splatseg.methods.cosseg.options.PUBLISHED_DROPOUT", 0.5)
+    setting = VISIBLE | {"sampling": "strata"}
     whole = trained(halves, encoder_file, **setting)
     again, _ = interrupted(halves, encoder_file, tmp_path, **setting)
     assert torch.equal(again.values, whole.values)
@@ -305,30 +304,25 @@ def test_what_was_interrupted_under_the_published_setting_goes_on(
     assert curve[-1][1] < curve[0][1]
 
 
-def test_the_published_setting(halves, encoder_file) -> None:
+def test_the_published_setting(monkeypatch) -> None:
     """As the papers print it: Dou et al. 3.3, 4.1; Hu et al. Fig. 7 and their S3DIS settings."""
+    monkeypatch.undo()
     published = CossegOptions.published()
     assert (published.rate, published.schedule, published.steps) == (1e-3, "constant", 10_000)
-    assert published.components == 64
-    assert (published.points, published.division, published.blend) == (
-        "visible", "pixels", "features",
-    )  # fmt: skip
+    assert (published.points, published.blend) == ("visible", "features")
     assert published.decoded == (32, 32, 128, 256, 512, 1024)
-    assert (published.head, published.dropout) == ((64, 32), 0.5)
+    assert (HEAD, COMPONENTS) == ((64, 32), 64)
+    assert (published.dropout, published.min_pixels) == (0.5, 10)
     assert (published.semantic, published.spatial) == ("all", "all")
-    assert (published.label_loss, published.weighting, published.transitions) == (
-        "cross_entropy", "none", "none",
-    )  # fmt: skip
     assert (published.held_out, published.patience, published.readout) == (0.0, 0, "rendered")
     assert (published.views_per_step, published.batch, published.sampling) == (8, 4096, "strata")
-    assert published.min_pixels == 10
 
 
 def test_the_published_setting_learns(halves, encoder_file) -> None:
     """As it is, but for widths and pixels; and it says how far it went."""
     options = replace(
         CossegOptions.published(steps=60), encoder=encoder_file, rate=0.01, batch=200, pixels=200,
-        decoded=(6, 5), views_per_step=4,
+        views_per_step=4,
     )  # fmt: skip
     features = train_cosseg(
         halves.gaussians, halves.views, halves.evidence, features=halves.blocks, options=options,
@@ -378,18 +372,13 @@ def test_bad_input_is_one_clear_sentence(halves, encoder_file) -> None:
     ("change", "message"),
     [
         ({"semantic": "none", "spatial": "none"}, "expected one of the two"),
-        ({"components": 0}, "components: expected at least 1"),
-        ({"min_pixels": -1}, "min_pixels: expected at least 0"),
         ({"views_per_step": 0}, "views_per_step: expected at least 1"),
-        ({"dropout": 1.0}, "dropout: expected at least 0 and below 1, got 1.0"),
-        ({"block_points": 0}, "block_points: expected at least 1"),
-        ({"lifted_side": 0}, "lifted_side: expected at least 1"),
-        ({"decoded": ()}, "decoded: expected numbers from 1"),
-        ({"head": (4, 0)}, "head: expected numbers from 1"),
-        ({"rate": -1.0}, "rate: expected 0 or more"),
-        ({"transition_rate": float("nan")}, "transition_rate: expected 0 or more"),
+        ({"joint_steps": 0}, "joint_steps: expected at least 1"),
+        ({"rate": -1.0}, "rate: expected at least 0"),
+        ({"spatial": "some"}, "spatial: expected one of"),
+        ({"transitions": "views"}, "transitions: this option was removed; it was measured"),
     ],
 )
 def test_options_out_of_range_are_refused(change, message) -> None:
-    with pytest.raises(RangeError, match=message):
+    with pytest.raises(InputError, match=message):
         CossegOptions(**change)

@@ -9,13 +9,12 @@ import torch
 from PIL import Image
 
 from splatseg.core import LabelMap
-from splatseg.errors import InputError, RangeError
-from splatseg.lift.point_network import SpatialOptions
+from splatseg.errors import InputError
 from splatseg.methods._label_models import linear_start
-from splatseg.methods.cosseg._distilled import distilled_features
-from splatseg.methods.cosseg._fusion import FusionShape, decode_all
-from splatseg.methods.cosseg._joint import JointOptions, LabelLoss, train_jointly
-from splatseg.methods.cosseg._points import PointSource
+from splatseg.methods.cosseg.decoder import FusionShape, decode_all
+from splatseg.methods.cosseg.features import distilled_features
+from splatseg.methods.cosseg.joint import LabelLoss, train_jointly
+from splatseg.methods.cosseg.points import PointSource
 from splatseg.render import render
 
 from .conftest import Maps
@@ -39,13 +38,9 @@ def photographed(halves, tmp_path_factory):
 
 
 def label_loss(halves, evidence=None, **changes) -> LabelLoss:
-    distilled = distilled_features(
-        halves.gaussians, halves.views, halves.blocks, components=8, division="mean",
-        backend=DRAWN_BY,
-    )  # fmt: skip
+    distilled = distilled_features(halves.gaussians, halves.views, halves.blocks, backend=DRAWN_BY)
     source = PointSource(
-        gaussians=halves.gaussians, scales=distilled.scales, encoder=None, spatial="none",
-        space=SpatialOptions(), up=None, seed=0,
+        gaussians=halves.gaussians, scales=distilled.scales, spatial="none", up=None, seed=0,
     )  # fmt: skip
     raw = source.raw(torch.arange(len(halves.gaussians)))
     points = raw.scaled(raw.scalings(), len(halves.gaussians))
@@ -54,14 +49,14 @@ def label_loss(halves, evidence=None, **changes) -> LabelLoss:
     weight, bias = linear_start(4, 2, rng)
     weights = shape.start(rng) | {"classifier.weight": weight, "classifier.bias": bias}
     given = {
-        "ids": IDS, "weight": 0.1, "rate": 0.02, "dropout": 0.0, "backend": DRAWN_BY,
+        "ids": IDS, "rate": 0.02, "dropout": 0.0, "backend": DRAWN_BY,
         "rng": np.random.default_rng(2),
     } | changes  # fmt: skip
     return LabelLoss(points, weights, evidence or halves.evidence, **given)
 
 
 def test_the_loss_by_hand(halves) -> None:
-    loss = label_loss(halves, weight=0.5)
+    loss = label_loss(halves)
     view, rows = halves.views[1], torch.arange(len(halves.gaussians))
     found = loss(view, halves.gaussians, rows).detach()
     # In the first step running statistics are those of the view, but for n / (n - 1) of variances.
@@ -72,8 +67,8 @@ def test_the_loss_by_hand(halves) -> None:
     logits = (shown @ weights["classifier.weight"].T + weights["classifier.bias"]).detach()
     label = (halves.ids(view).reshape(-1) == 8).long()
     each = -torch.log_softmax(logits, dim=1)[torch.arange(len(label)), label]
-    assert float(found) == pytest.approx(0.5 * float(each.mean()) / math.log(2), rel=1e-3)
-    assert loss.losses == [pytest.approx(float(found) / 0.5)]
+    assert float(found) == pytest.approx(0.1 * float(each.mean()) / math.log(2), rel=1e-3)
+    assert loss.losses == [pytest.approx(float(found) / 0.1)]
 
 
 def test_drop_out_is_drawn(halves) -> None:
@@ -99,11 +94,10 @@ def test_pixels_without_a_label_say_nothing(halves) -> None:
     assert float(first) != float(second)
 
 
-def trained(halves, photographed, *, seed=0, rate=0.02, **changes):
-    loss = label_loss(halves, rate=rate, weight=changes.get("label_weight", 0.1))
-    options = JointOptions(**{"joint_steps": 24} | changes)
+def trained(halves, photographed, *, steps=24):
+    loss = label_loss(halves)
     return loss, train_jointly(
-        halves.gaussians, photographed, loss, options=options, backend=DRAWN_BY, seed=seed
+        halves.gaussians, photographed, loss, steps=steps, backend=DRAWN_BY, seed=0
     )
 
 
@@ -111,7 +105,7 @@ def test_both_are_learnt(halves, photographed) -> None:
     told: list[tuple[int, int]] = []
     loss = label_loss(halves)
     found = train_jointly(
-        halves.gaussians, photographed, loss, options=JointOptions(joint_steps=60),
+        halves.gaussians, photographed, loss, steps=60,
         backend=DRAWN_BY, seed=0, progress=lambda *step: told.append(step),
     )  # fmt: skip
     assert told[-1] == (60, 60)
@@ -128,20 +122,17 @@ def test_both_are_learnt(halves, photographed) -> None:
 
 
 @pytest.mark.parametrize(
-    "change",
-    [{"rgb_weight": 0.8}, {"label_weight": 3.0}, {"joint_start": 0.1}, {"joint_steps": 20}],
+    ("name", "value"), [("RGB_WEIGHT", 0.8), ("LABEL_WEIGHT", 0.0), ("PROGRESS", 0.1)]
 )
-def test_each_option_makes_a_difference(halves, photographed, change) -> None:
+def test_each_constant_counts(halves, photographed, monkeypatch, name, value) -> None:
     _, usual = trained(halves, photographed)
-    _, changed = trained(halves, photographed, **change)
+    monkeypatch.setattr(f"splatseg.methods.cosseg.joint.{name}", value)
+    _, changed = trained(halves, photographed)
     assert not torch.equal(usual.means, changed.means)
 
 
 @pytest.mark.bits
-def test_labels_move_gaussians_and_bits_repeat(halves, photographed) -> None:
-    _, without = trained(halves, photographed, label_weight=0.0)
-    _, labelled = trained(halves, photographed)
-    assert not torch.equal(without.means, labelled.means)
+def test_bits_repeat(halves, photographed) -> None:
     before = torch.get_num_threads()
     try:
         torch.set_num_threads(1)
@@ -157,11 +148,5 @@ def test_labels_move_gaussians_and_bits_repeat(halves, photographed) -> None:
 def test_what_cannot_be_is_refused(halves, photographed) -> None:
     with pytest.raises(InputError, match="photographs of all of them, 4 of 4 have none, .* v0"):
         train_jointly(
-            halves.gaussians, halves.views, label_loss(halves), options=JointOptions(),
-            backend=DRAWN_BY, seed=0,
-        )  # fmt: skip
-    for change in (
-        {"joint_steps": 0}, {"rgb_weight": 1.1}, {"joint_start": -0.1}, {"label_weight": -1.0},
-    ):  # fmt: skip
-        with pytest.raises(RangeError, match=next(iter(change))):
-            JointOptions(**change)
+            halves.gaussians, halves.views, label_loss(halves), steps=2, backend=DRAWN_BY, seed=0
+        )

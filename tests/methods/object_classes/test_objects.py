@@ -8,14 +8,15 @@ import torch
 from methods.cosseg.conftest import Maps
 from splatseg.core import LabelMap, Labels, LayerInfo
 from splatseg.errors import RangeError
-from splatseg.lift.object_classes import ObjectClassOptions, PooledObjects, pool_objects
-from splatseg.methods.object_classes import ObjectLabelOptions
-from splatseg.methods.object_classes._objects import (
+from splatseg.methods.object_classes import (
+    MAX_CORRELATION,
+    ObjectLabelOptions,
     ObjectLabels,
     label_objects,
     named_by_tracks,
+    own_share,
 )
-from splatseg.methods.object_classes._shares import own_share
+from splatseg.methods.object_classes.classify import PooledObjects
 
 
 class Masks:
@@ -74,7 +75,7 @@ def test_an_object_has_one_label_though_parts_of_it_are_outvoted(halves) -> None
         halves.gaussians, halves.views[::-1], strip(halves, ("v0", "v1", "v2")),
         features=halves.blocks, masks=Masks(halves),
         options=ObjectLabelOptions(candidates=1, own_share=0.0),
-        told=lambda *step: told.append(step),
+        progress=lambda *step: told.append(step),
     )  # fmt: skip
     assert torch.equal(again.classes.ids, found.classes.ids)
     assert again.classes.candidates is None
@@ -98,31 +99,6 @@ def test_what_is_in_no_object_keeps_its_votes(halves) -> None:
     assert bool((found.classes.ids[right] == 8).all())
 
 
-def pooled_features(halves, monkeypatch, **change):
-    """The features that objects are pooled of."""
-    kept: list[list[torch.Tensor]] = []
-
-    def keep(objects, votes, scales, weights):
-        kept.append([scale.clone() for scale in scales])
-        return pool_objects(objects, votes, scales, weights)
-
-    monkeypatch.setattr("splatseg.methods.object_classes._objects.pool_objects", keep)
-    labelled(halves, halves.evidence, **change)
-    return kept[0]
-
-
-def test_options_say_which_features_are_pooled(halves, monkeypatch) -> None:
-    usual = pooled_features(halves, monkeypatch, compared="all")
-    assert [one.shape[1] for one in usual] == [3, 2]
-    deepest = pooled_features(halves, monkeypatch)
-    assert len(deepest) == 1
-    assert torch.equal(deepest[0], usual[1])
-    small = pooled_features(halves, monkeypatch, lifted_side=8)
-    assert not torch.equal(small[0], deepest[0])
-    reduced = pooled_features(halves, monkeypatch, compared="all", components=2)
-    assert [one.shape[1] for one in reduced] == [2, 2]
-
-
 def test_labels_of_tracks_are_objects_with_classes(halves) -> None:
     found = labelled(halves, halves.evidence, categories={3: {30: 5.0, 80: 2.0}, 8: {80: 1.0}})
     assert found.classes is None
@@ -131,13 +107,11 @@ def test_labels_of_tracks_are_objects_with_classes(halves) -> None:
     assert bool((of == halves.side * 10)[away(halves)].all())
 
 
-def test_rounds_tell_the_objects_of_a_track_apart(halves) -> None:
+def test_rounds_tell_the_objects_of_a_track_apart(halves, monkeypatch) -> None:
     sure = {}
     for rounds in (1, 10):
-        found = labelled(
-            halves, strip(halves), classification=ObjectClassOptions(category_rounds=rounds),
-            categories={3: {30: 5.0}, 8: {80: 4.0, 30: 2.0}},
-        )  # fmt: skip
+        monkeypatch.setattr("splatseg.methods.object_classes.classify.CATEGORY_ROUNDS", rounds)
+        found = labelled(halves, strip(halves), categories={3: {30: 5.0}, 8: {80: 4.0, 30: 2.0}})
         sure[rounds] = found.objects.info.details["mean_class_probability"]
     assert sure[10] > sure[1]
 
@@ -212,23 +186,19 @@ def sure(ids, correlation=None) -> Labels:
 
 
 @pytest.mark.parametrize(
-    ("correlation", "limit", "expected"),
-    [(0.1, 0.4, 0.75), (0.4, 0.4, 0.0), (0.9, 0.4, 0.0), (-0.2, 0.4, 1.0), (None, 0.4, 0.0),
-     (0.1, 0.0, 0.0)],
-)  # fmt: skip
-def test_the_share_of_own_votes_falls_with_the_correlation_of_views(
-    correlation, limit, expected
-) -> None:
+    ("correlation", "expected"),
+    [(MAX_CORRELATION / 4, 0.75), (MAX_CORRELATION, 0.0), (0.9, 0.0), (-0.2, 1.0), (None, 0.0)],
+)
+def test_the_share_of_own_votes_falls_with_the_correlation_of_views(correlation, expected) -> None:
     votes = sure([5, 5, 7, 7], correlation)
     objects = sure([1, 1, 2, 2])
-    found = own_share(ObjectLabelOptions(max_correlation=limit), objects, votes)
+    found = own_share(ObjectLabelOptions(), objects, votes)
     assert found.share == pytest.approx(expected)
     assert found.heterogeneity == 0
-    given = ObjectLabelOptions(max_correlation=limit, own_share=0.3)
-    assert own_share(given, objects, votes).share == 0.3
+    assert own_share(ObjectLabelOptions(own_share=0.3), objects, votes).share == 0.3
 
 
-def test_own_votes_count_where_objects_are_none() -> None:
+def test_own_votes_count_where_objects_are_none(monkeypatch) -> None:
     """Half of what Gaussians disagree about is between those of one object: (0 + 1/2) / 1."""
     votes, objects = sure([5, 7, 5, 7], 0.9), sure([1, 1, 2, 3])
     assert own_share(ObjectLabelOptions(), objects, votes).heterogeneity == 1
@@ -238,22 +208,15 @@ def test_own_votes_count_where_objects_are_none() -> None:
     shares = torch.tensor([[1.0, 0.0], [0.0, 1.0], [0.5, 0.5], [0.5, 0.5]])
     half = replace(mixed, shares=shares)
     # Objects 1, 2 and 3 have 2, 1 and 1 of the mass and half of it each disagrees.
-    found = own_share(ObjectLabelOptions(max_heterogeneity=0.4), objects, half)
-    assert found.heterogeneity == pytest.approx(0.5)
-    assert found.share == pytest.approx(0.25)
-    assert own_share(ObjectLabelOptions(max_heterogeneity=0.2), objects, half).share == 1
-    assert own_share(ObjectLabelOptions(max_heterogeneity=0.6), objects, half).share == 0
+    for limit, share in ((0.4, 0.25), (0.2, 1.0), (0.6, 0.0)):
+        monkeypatch.setattr("splatseg.methods.object_classes.MAX_HETEROGENEITY", limit)
+        found = own_share(ObjectLabelOptions(), objects, half)
+        assert found.heterogeneity == pytest.approx(0.5)
+        assert found.share == pytest.approx(share)
 
 
-@pytest.mark.parametrize("name", ["own_share", "max_correlation"])
-def test_shares_beyond_one_are_refused(name) -> None:
-    with pytest.raises(RangeError, match=rf"^{name}: expected a value in \[0, 1\], got 1\.5\."):
-        ObjectLabelOptions(**{name: 1.5})
-    with pytest.raises(RangeError, match="max_heterogeneity: expected above 0 and at most 1"):
-        ObjectLabelOptions(max_heterogeneity=0.0)
-
-
-@pytest.mark.parametrize("name", ["lifted_side", "components", "candidates"])
-def test_counts_below_one_are_refused(name) -> None:
-    with pytest.raises(RangeError, match=f"^{name}: expected at least 1, got 0"):
-        ObjectLabelOptions(**{name: 0})
+def test_options_are_held_to_their_ranges() -> None:
+    with pytest.raises(RangeError, match=r"^own_share: expected"):
+        ObjectLabelOptions(own_share=1.5)
+    with pytest.raises(RangeError, match="^candidates: expected at least 1, got 0"):
+        ObjectLabelOptions(candidates=0)

@@ -9,7 +9,7 @@ from methods.prompt.conftest import HEIGHT, WIDTH
 from splatseg.core import MaskSet, Prompt, Rle
 from splatseg.core.models import Embedding
 from splatseg.errors import InputError, ShapeError
-from splatseg.methods.prompt._masks import ModelMasks, RecordedMasks, holds
+from splatseg.methods.prompt.masks import ModelMasks, RecordedMasks, holds
 
 
 def rectangle(top: int, left: int, bottom: int, right: int) -> torch.Tensor:

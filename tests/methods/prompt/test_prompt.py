@@ -1,11 +1,17 @@
 """From words, or points by hand, to a selection."""
 
+import json
+import shutil
+from pathlib import Path
+
 import pytest
 import torch
 
 from methods.prompt.conftest import APPLE, PEAR, agreement
+from splatseg.cli import main
 from splatseg.core import Selection
 from splatseg.errors import InputError, RangeError
+from splatseg.io.scene import load_scene, load_scene_layer
 from splatseg.methods import MethodInputs, find_method
 from splatseg.methods.prompt import (
     PUBLISHED,
@@ -13,7 +19,10 @@ from splatseg.methods.prompt import (
     PromptSession,
     PromptSources,
     parsed_points,
+    select,
+    views,
 )
+from splatseg.tasks import SegmentOptions, segment
 
 
 def test_words_select_their_thing(fruit) -> None:
@@ -36,7 +45,7 @@ def test_the_same_whatever_the_order_of_views(fruit) -> None:
         )
         return session.ask(["apple"]).confidence
 
-    for options in ({}, {"sampling": "random", "initial": "random", "view_choice": "random"}):
+    for options in ({}, {"sampling": "random", "initial": "random"}):
         assert torch.equal(asked(fruit.views, **options), asked(fruit.views[::-1], **options))
 
 
@@ -46,20 +55,16 @@ def test_the_same_whatever_the_order_of_views(fruit) -> None:
         {"vote": "visible"},
         {"vote": "published"},
         {"threshold": 0.9},
-        {"least_light": 5.0},
-        {"points": 1, "rounds": 1},
+        {"rounds": 1},
         {"view_share": 0.3},
-        {"view_share": 0.3, "view_choice": "random"},
+        {"view_share": 0.3, "sampling": "random"},
     ],
 )
 def test_options_change_the_answer(fruit, change) -> None:
-    base = {"view_share": 0.3, "view_choice": "coverage"} if "view_choice" in change else {}
+    base = {"view_share": 0.3} if "sampling" in change else {}
     usual = fruit.session(**base).ask(["wall"])
     other = fruit.session(**change).ask(["wall"])
-    assert not torch.equal(usual.confidence, other.confidence) or change == {
-        "points": 1,
-        "rounds": 1,
-    }
+    assert not torch.equal(usual.confidence, other.confidence) or "rounds" in change
     assert usual.mask_calls != other.mask_calls or "rounds" not in change
 
 
@@ -72,20 +77,22 @@ def test_points_are_recorded(fruit) -> None:
     assert [place["view"] for place in usual] == [f"v{i}" for i in range(9)]
     assert all(len(place["points"]) == 2 for place in usual)
     assert all(len(place["negative_points"]) == 4 for place in usual)
-    assert all(len(place["points"]) == 3 for place in records(points=3))
-    assert all(not place["negative_points"] for place in records(negatives=0))
-    assert records(sampling="random") != usual
+    random = records(sampling="random")
+    assert all(len(place["points"]) == 2 for place in random)
+    assert all(not place["negative_points"] for place in random)
+    assert random != usual
     assert len(records(initial="single")) == 1
     assert len(records(initial_views=2)) == 2
     assert len(records(initial="random", initial_views=3)) == 3
 
 
-def test_hidden_points_are_not_given(fruit) -> None:
+def test_hidden_points_are_not_given(fruit, monkeypatch) -> None:
     """Points on the wall that the apple hides from the left would rule out the apple's mask."""
-    shown = fruit.session(rounds=1, occlusion="none", negatives=8)
-    kept = fruit.session(rounds=1, occlusion="depth", negatives=8)
-    strict = fruit.session(rounds=1, occlusion="depth", depth_tolerance=0.0, negatives=8)
-    counts = [_points_given(session) for session in (shown, kept, strict)]
+    monkeypatch.setattr(select, "NEGATIVES", 8)
+    counts = []
+    for tolerance in (float("inf"), 0.05, 0.0):
+        monkeypatch.setattr(select, "DEPTH_TOLERANCE", tolerance)
+        counts.append(_points_given(fruit.session(rounds=1)))
     assert counts[0] > counts[1] > counts[2]
 
 
@@ -131,19 +138,20 @@ def test_points_may_lie_in_views_that_are_not_used(fruit) -> None:
         session.ask_points([point])
 
 
-def test_lifting_and_tolerance_matter(fruit) -> None:
+def test_lifting_and_tolerance_matter(fruit, monkeypatch) -> None:
     def points(**options):
-        from splatseg.methods.prompt._select import sampled_points, world_prompts
+        chosen = PromptOptions(**options)
+        found = fruit.session().find("apple")[0]
+        given = [("apple", select.sampled_points(found, "apple", chosen, seed=0))]
+        return select.world_prompts(fruit.gaussians, given, chosen, backend="auto")[0].points
 
-        chosen = PromptOptions(negatives=0, **options)
-        found = fruit.session(negatives=0).find("apple")[0]
-        given = [("apple", sampled_points(found, "apple", chosen, seed=0))]
-        return world_prompts(fruit.gaussians, given, chosen, backend="auto")[0].points
-
+    monkeypatch.setattr(select, "NEGATIVES", 0)
     weight, centre = points(), points(lifting="centre")
     assert not torch.equal(weight, centre)
-    assert not torch.equal(points(lifting="centre", tolerance=2.0), centre)
-    assert not len(points(lifting="centre", tolerance=0.0))
+    monkeypatch.setattr(views, "TOLERANCE", 2.0)
+    assert not torch.equal(points(lifting="centre"), centre)
+    monkeypatch.setattr(views, "TOLERANCE", 0.0)
+    assert not len(points(lifting="centre"))
     # Both lie on the apple: it has a radius of 0.12 around (-0.5, 0, 2.5).
     for found in (weight, centre):
         away = (found - torch.tensor([-0.5, 0.0, 2.5], dtype=torch.float64)).norm(dim=1)
@@ -168,8 +176,9 @@ def test_points_by_hand_are_one_object(fruit) -> None:
         parsed_points(("v4,3",))
 
 
-def test_no_mask_at_the_points(fruit) -> None:
-    sky = fruit.session(lifting="centre", tolerance=0.0)
+def test_no_mask_at_the_points(fruit, monkeypatch) -> None:
+    monkeypatch.setattr(views, "TOLERANCE", 0.0)
+    sky = fruit.session(lifting="centre")
     with pytest.raises(InputError, match="masks: expected a mask at the points in at least one"):
         sky.ask_points([("v4", 30.0, 20.0)])
 
@@ -177,15 +186,14 @@ def test_no_mask_at_the_points(fruit) -> None:
 def test_published_is_the_setting_of_the_paper() -> None:
     """Written out from the paper: sections 3.2 to 3.4, 4.1; the vote of SA-GS is over 0.7."""
     assert (PUBLISHED.initial, PUBLISHED.initial_views) == ("kmeans", 4)
-    assert (PUBLISHED.points, PUBLISHED.sampling, PUBLISHED.negatives) == (2, "random", 0)
-    assert (PUBLISHED.lifting, PUBLISHED.tolerance) == ("centre", 10.0), "eq. 6"
-    assert (PUBLISHED.view_share, PUBLISHED.view_choice) == (0.5, "random")
-    assert (PUBLISHED.occlusion, PUBLISHED.rounds) == ("none", 1)
+    assert (select.POINTS, PUBLISHED.sampling) == (2, "random")
+    assert (PUBLISHED.lifting, views.TOLERANCE) == ("centre", 10.0), "eq. 6"
+    assert (PUBLISHED.view_share, PUBLISHED.rounds) == (0.5, 1)
     assert (PUBLISHED.vote, PUBLISHED.tau) == ("published", 0.6), "eq. 8"
     assert (PUBLISHED.region, PUBLISHED.objects, PUBLISHED.phrases) == ("cells", "one", "whole")
     assert PromptOptions(vote="published", point=("v:1,1",)).tau == 0.7
     assert PromptOptions(threshold=0.3).tau == 0.3
-    assert PromptOptions(objects="all").least_probability == 0.3
+    assert PromptOptions(objects="all").probability_limit == 0.3
     assert find_method("prompt").published_options == PUBLISHED
 
 
@@ -238,17 +246,14 @@ def test_masks_alone_will_do_for_points(fruit) -> None:
         ({"objects": "two"}, "objects: expected"),
         ({"sampling": "rim"}, "sampling: expected"),
         ({"lifting": "nearest"}, "lifting: expected"),
-        ({"view_choice": "first"}, "view_choice: expected"),
-        ({"occlusion": "some"}, "occlusion: expected"),
+        ({"view_choice": "first"}, "view_choice: this option was removed; it follows sampling"),
+        ({"occlusion": "none"}, "occlusion: this option was removed; it follows sampling"),
         ({"vote": "all"}, "vote: expected"),
         ({"initial_views": 0}, "initial_views: expected at least 1"),
-        ({"points": 0}, "points: expected at least 1"),
-        ({"negatives": -1}, "negatives: expected at least 0"),
+        ({"points": 1}, "points: this option was removed"),
         ({"rounds": 0}, "rounds: expected at least 1"),
-        ({"tolerance": float("nan")}, "tolerance: expected 0 or more"),
-        ({"depth_tolerance": -1.0}, "depth_tolerance: expected 0 or more"),
-        ({"least_light": -0.1}, "least_light: expected 0 or more"),
-        ({"view_share": 0.0}, "view_share: expected above 0"),
+        ({"least_light": 0.1}, "least_light: this option was removed"),
+        ({"view_share": 0.0}, "view_share: expected"),
         ({"threshold": 1.5}, "threshold: expected"),
         ({"min_probability": -0.1}, "min_probability: expected"),
     ],
@@ -262,3 +267,68 @@ def test_published_votes_are_shares_of_all_views(fruit) -> None:
     """The wall behind the apple is in its mask in a few views of nine."""
     made = fruit.session(vote="published", rounds=1).ask(["apple"])
     assert agreement(made.confidence, fruit.ids == APPLE) > 0.9
+
+
+@pytest.fixture(scope="module")
+def folder(fitted_room, tmp_path_factory) -> Path:
+    return Path(shutil.copytree(fitted_room, tmp_path_factory.mktemp("prompt") / "scene"))
+
+
+def test_words_from_the_command_line(folder, capsys) -> None:
+    words = ("segment", folder, "--method", "prompt", "--evidence", "features_text", "--masks",
+             "masks_sam", "--words", "table", "--layer", "tables", "--initial-views", 4,
+             "--min-probability", 0, "--json")  # fmt: skip
+    assert main([str(word) for word in words]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["kind"] == "selection"
+    assert 0 < said["selected"] < said["gaussians"]
+    layer = load_scene_layer(folder, "tables")
+    assert isinstance(layer, Selection)
+    assert layer.count == said["selected"]
+    assert layer.info.method == "prompt"
+    assert len(layer.info.details["initial_views"]) == 4
+    assert all(name.startswith("train") for name in layer.info.details["initial_views"])
+    assert main([*(str(word) for word in words[:-1])]) == 0
+    assert f"{layer.count} of {len(layer)} Gaussians" in capsys.readouterr().out
+
+
+def test_published_from_the_command_line(folder, capsys) -> None:
+    words = ("segment", folder, "--method", "prompt", "--evidence", "masks_sam", "--point",
+             "train_0000:160,150", "--published", "--layer", "hand", "--view-share", 1)  # fmt: skip
+    assert main([str(word) for word in words]) == 0
+    layer = load_scene_layer(folder, "hand")
+    assert layer.info.options["vote"] == "published"
+    assert layer.info.options["view_share"] == 1.0
+    capsys.readouterr()
+    assert main([str(word) for word in (*words, "--export")]) == 2
+    assert "gives selection" in capsys.readouterr().err
+
+
+def test_models_by_name(folder) -> None:
+    scene = load_scene(folder)
+    options = SegmentOptions(evidence="masks_sam")
+    by_hand = PromptOptions(point=("train_0000:160,150",), view_share=0.2, rounds=1)
+    made = segment(
+        scene,
+        "prompt",
+        options=options,
+        method_options=PromptOptions(
+            point=by_hand.point, view_share=0.2, rounds=1, prompter="classical"
+        ),
+    ).layer
+    assert isinstance(made, Selection)
+    assert made.info.options["prompter"] == "classical"
+    with pytest.raises(InputError, match="grounder: expected a model that is a GroundedMasks"):
+        segment(
+            scene,
+            "prompt",
+            options=options,
+            method_options=PromptOptions(words=("table",), grounder="classical"),
+        )
+    with pytest.raises(InputError, match="encoder: expected a model that is a TextFeatures"):
+        segment(
+            scene,
+            "prompt",
+            options=options,
+            method_options=PromptOptions(words=("table",), encoder="classical"),
+        )

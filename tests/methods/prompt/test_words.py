@@ -7,16 +7,18 @@ import pytest
 import torch
 
 from methods.prompt.conftest import APPLE, PEAR, vectors, write_features
-from splatseg.core import MaskSet, Rle
+from splatseg.core import MaskSet, Rle, View
 from splatseg.core.models import TextMasks
 from splatseg.errors import InputError, ShapeError
 from splatseg.io.evidence import TextEmbeddings
 from splatseg.lift import TextSpace
+from splatseg.lift.phrases import ThingLooks
 from splatseg.lift.vocabulary import Vocabulary
-from splatseg.methods.prompt import PromptOptions, PromptSession, PromptSources, _table
-from splatseg.methods.prompt._linked import linked
-from splatseg.methods.prompt._table import mask_table, painted
-from splatseg.methods.prompt._words import MaskAnswers
+from splatseg.lift.words import WordAnswers
+from splatseg.methods.prompt import PromptOptions, PromptSession, PromptSources, masks
+from splatseg.methods.prompt.masks import MaskTable, mask_table, painted
+from splatseg.methods.prompt.words import MaskAnswers, answering, linked, mask_groups
+from support.red_square import SIZE, camera
 
 
 @pytest.fixture(scope="module")
@@ -253,7 +255,80 @@ def test_a_phrase_is_asked_by_its_parts(fruit) -> None:
 )
 def test_looks_are_found_where_they_are_asked_for(fruit, monkeypatch, options, wanted) -> None:
     made = []
-    original = _table._looks
-    monkeypatch.setattr(_table, "_looks", lambda *given: made.append(1) or original(*given))
+    original = masks._looks
+    monkeypatch.setattr(masks, "_looks", lambda *given: made.append(1) or original(*given))
     fruit.session(**options, initial_views=2).find("apple")
     assert bool(made) == wanted
+
+
+PART, THING, GROUP, OTHER = range(4)
+SIDES = (4, 10, 24, 6)
+HELD = torch.tensor(
+    [[1, 0.9, 1, 0], [0.1, 1, 1, 0], [0.05, 0.3, 1, 0], [0, 0, 0, 1]], dtype=torch.float32
+)
+"""Share of the row's mask that the column's has."""
+
+
+@pytest.fixture
+def table_of_groups() -> MaskTable:
+    """Two views of a part in a thing in a group, and something else."""
+    masks = torch.zeros(4, SIZE, SIZE, dtype=torch.bool)
+    for row, side in enumerate(SIDES[:OTHER]):
+        masks[row, :side, :side] = True
+    masks[OTHER, -SIDES[OTHER] :, -SIDES[OTHER] :] = True
+    same = torch.eye(4).tile(2, 2)
+    return MaskTable(
+        views=tuple(View(name=name, camera=camera(0)) for name in ("a", "b")),
+        masks=(MaskSet.from_dense(masks),) * 2,
+        view=torch.tensor([0] * 4 + [1] * 4),
+        index=torch.arange(4).tile(2),
+        values=torch.eye(4).tile(2, 1),
+        cells=torch.tensor([float(side**2) for side in SIDES]).tile(2),
+        iou=same,
+        contained=HELD.tile(2, 2),
+        looks=ThingLooks(
+            colours=torch.zeros(8, 3), low=torch.zeros(8, 3), high=torch.ones(8, 3), has_up=False
+        ),
+    )
+
+
+def meant(
+    table_of_groups: MaskTable, cosines: list[float], probabilities: list[float]
+) -> int | None:
+    answers = WordAnswers(
+        words=("mug",),
+        cosines=torch.tensor(cosines * 2)[:, None],
+        probabilities=torch.tensor(probabilities * 2)[:, None],
+    )
+    found = answering(
+        table_of_groups, mask_groups(table_of_groups), answers, several=False, least=0.05
+    )
+    if not found:
+        return None
+    (one,) = found
+    assert [view.name for view, _ in one.masks] == ["a", "b"]
+    return [side**2 for side in SIDES].index(one.masks[0][1].area)
+
+
+def test_a_thing_is_meant_and_not_its_part(table_of_groups) -> None:
+    sure = [0.9] * 4
+    assert meant(table_of_groups, [0.98, 0.97, 0.3, 0.1], sure) == THING
+    assert meant(table_of_groups, [0.97, 0.98, 0.3, 0.1], sure) == THING
+
+
+def test_a_part_is_meant_where_the_whole_answers_less(table_of_groups) -> None:
+    assert meant(table_of_groups, [0.98, 0.90, 0.3, 0.1], [0.9] * 4) == PART
+    assert meant(table_of_groups, [0.98, 0.97, 0.3, 0.1], [0.9, 0.01, 0.01, 0.0]) == PART
+
+
+def test_what_does_not_hold_it_is_no_whole_of_it(table_of_groups) -> None:
+    assert meant(table_of_groups, [0.95, 0.2, 0.3, 0.96], [0.9] * 4) == OTHER
+    assert meant(table_of_groups, [0.96, 0.2, 0.3, 0.95], [0.9] * 4) == PART
+
+
+def test_the_whole_may_be_a_group(table_of_groups) -> None:
+    assert meant(table_of_groups, [0.97, 0.97, 0.96, 0.1], [0.9] * 4) == GROUP
+
+
+def test_nothing_answers(table_of_groups) -> None:
+    assert meant(table_of_groups, [0.98, 0.97, 0.3, 0.1], [0.01] * 4) is None

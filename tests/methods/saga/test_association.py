@@ -7,19 +7,17 @@ import torch
 from splatseg.core import InstanceTree, Labels, TreeNode
 from splatseg.lift.affinity import AffinityHead
 from splatseg.methods.associate import associate, associate_masks
-from splatseg.methods.saga._association import (
+from splatseg.methods.saga.masks import (
     UNLABELLED_LENGTH,
     MaskSegments,
     association_start,
     divisions,
     level_cut,
     level_masks,
-    level_scales,
     node_codes,
     spread_directions,
 )
-from splatseg.methods.saga._mask_table import mask_table
-from splatseg.methods.saga._model import gate_start
+from splatseg.methods.saga.model import gate_start
 
 from .test_saga import trained
 
@@ -50,7 +48,7 @@ def tree_of(ids, candidates=None, shares=None) -> InstanceTree:
 
 
 def head() -> AffinityHead:
-    weight, bias = gate_start(CHANNELS, "levels", rng())
+    weight, bias = gate_start(CHANNELS)
     return AffinityHead(channels=CHANNELS, unit=True, gate_weight=weight, gate_bias=bias)
 
 
@@ -123,13 +121,8 @@ def test_scales_of_masks_are_the_levels_of_their_nodes() -> None:
     tree = InstanceTree(
         nodes=nested, labels=Labels(ids=torch.tensor([7]), confidence=torch.ones(1))
     )
-    nodes = torch.tensor([4, 1, 3, 5, 6, 7, -1, -1, -1])
-    sizes = torch.tensor([9.0, 5, 6, 2, 1.5, 1, 20.0, 5.5, 0.1], dtype=torch.float64)
-    found = level_scales(tree, nodes, sizes)
-    assert found[:6].tolist() == [1.0, 0.5, 0.5, 0.125, 0.0, 0.0]
-    assert found[6:].tolist() == [1.0, 0.5, 0.0]  # as large as the group, between objects, small
-    unknown = torch.full((2,), -1)
-    assert level_scales(tree, unknown, sizes[:2]).tolist() == [0.5, 0.5]
+    found = level_masks(tree, torch.tensor([4, 1, 3, 5, 6, 7, -1]))
+    assert found.scales[0].tolist() == [1.0, 0.5, 0.5, 0.125, 0.0, 0.0, 0.0]
 
 
 def test_a_scale_counts_all_masks_of_the_level_that_it_stands_for() -> None:
@@ -175,20 +168,19 @@ def test_each_mask_is_told_its_node(walls) -> None:
         assert nodes == found.nodes["v0"].tolist()
         assert [level[id] for id in nodes] == ["object", "object", "part", "part"]
         assert [found.tree.node(id).parent for id in nodes[2:]] == nodes[:2]
-    table = mask_table(walls.gaussians, walls.views, walls.evidence).by_level(found)
-    assert table.ranks.tolist() == [0.5, 0.5, 0.0, 0.0] * 3
-    assert (table.levels, table.quantiles) == ((1.0, 0.5, 0.0), None)
+    levels = level_masks(found.tree, torch.from_numpy(np.concatenate([*found.nodes.values()])))
+    assert levels.scales[0].tolist() == [0.5, 0.5, 0.0, 0.0] * 3
 
 
-def test_without_a_rate_features_stay_at_the_start(walls) -> None:
+def test_without_a_rate_features_stay_at_the_start(walls, monkeypatch) -> None:
     """What training begins with, seen through all of it; and levels are what scales mean."""
-    features = trained(walls, rate=0.0, gate_rate=0.0, smoothing=1)
+    monkeypatch.setattr("splatseg.methods.saga.model._GATE_RATE", 0.0)
+    features = trained(walls, rate=0.0)
     tree = associate_masks(walls.gaussians, walls.views, MaskSegments(walls.evidence)).tree
     start = association_start(tree, CHANNELS, np.random.default_rng((3, 0x5A6A)))
     torch.testing.assert_close(features.values, torch.nn.functional.normalize(start, dim=1))
     read = AffinityHead.of(features)
     assert read.levels == (1.0, 0.5, 0.0)
-    assert AffinityHead.of(trained(walls, mask_scale="size", steps=1)).levels != read.levels
     middle = walls.means[:, 0].abs() > 0.15
     directions = read.directions(features.values, read.scale(0.5))[middle]
     similarity, half = directions @ directions.T, walls.half[middle]
@@ -196,11 +188,12 @@ def test_without_a_rate_features_stay_at_the_start(walls) -> None:
     assert float(similarity[same].min()) > 0.75 > 0.3 > float(similarity[~same].max())
 
 
-def test_the_start_is_kept_where_training_makes_it_worse(walls) -> None:
-    changes = {"held_out": 0.4, "score_every": 5, "steps": 10, "smoothing": 1}
-    spoilt = trained(walls, rate=20.0, schedule="constant", **changes)
+def test_the_start_is_kept_where_training_makes_it_worse(walls, monkeypatch) -> None:
+    monkeypatch.setattr("splatseg.methods.saga.options._SCORE_EVERY", 5)
+    spoilt = trained(walls, rate=20.0, held_out=0.4, steps=10)
     scores = dict(spoilt.info.details["scores"])
     assert set(scores) == {0, 5, 10}
     assert scores[0] > max(scores[5], scores[10])
     assert spoilt.info.details["best_step"] == 0
-    assert torch.equal(spoilt.values, trained(walls, rate=0.0, gate_rate=0.0, **changes).values)
+    monkeypatch.setattr("splatseg.methods.saga.model._GATE_RATE", 0.0)
+    assert torch.equal(spoilt.values, trained(walls, rate=0.0, held_out=0.4, steps=10).values)

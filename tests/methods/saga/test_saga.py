@@ -18,17 +18,16 @@ from splatseg.lift.training import RowSampler
 from splatseg.methods import MethodInputs, find_method
 from splatseg.methods._trained_labels import TrainingContext, loss_curve
 from splatseg.methods.saga import SagaOptions, train_saga, trained_as_published
-from splatseg.methods.saga._targets import SagaTargets
+from splatseg.methods.saga.options import CHANNELS, PUBLISHED_RATE
+from splatseg.methods.saga.train import SagaTargets
 from splatseg.render import weights
 from splatseg_bench.measures import learned_bytes
 
-from .conftest import Grids, Masks
+from .conftest import HEIGHT, WIDTH, Grids, Masks
 
 SHORT = 300
 DRAWN_BY = "auto"  # training is the same on all; what renders is tested in lift
-QUICK = {
-    "steps": 60, "batch": 200, "pixels": 200, "views_per_batch": 1, "held_out": 0.0, "smoothing": 4,
-}  # fmt: skip
+QUICK = {"steps": 60, "batch": 200, "held_out": 0.0}
 
 
 def context(**changes) -> TrainingContext:
@@ -53,16 +52,12 @@ def separation(features: Features, ids: torch.Tensor, scale: float) -> tuple[flo
 
 def test_one_training_serves_windows_and_walls(walls) -> None:
     """At the scale of windows these part from their walls; at that of walls they are one."""
-    features = trained(
-        walls, steps=300, smoothing=1, start="normal", mask_scale="size", gate="steps", rate=0.05
-    )
+    features = trained(walls, steps=100)
     head = AffinityHead.of(features)
     assert head.gated
     assert head.unit
-    assert head.levels[0] > head.levels[2]
-    # Every window is smaller than every half; between them ranks are 0.5.
-    small, large = 0.5, 1.0
-    assert head.scale(1.0) < small < head.scale(0.0)
+    assert head.levels == (1.0, 0.5, 0.0)
+    small, large = 0.0, 0.5
     same, other = separation(features, walls.half, large)
     assert same - other > 0.4
     window, wall = walls.part == 1, walls.part == 0
@@ -72,7 +67,7 @@ def test_one_training_serves_windows_and_walls(walls) -> None:
     ]
     assert between[1] - between[0] > 0.1
     info = features.info
-    assert (info.method, info.seed, info.details["steps"]) == ("saga", 3, 300)
+    assert (info.method, info.seed, info.details["steps"]) == ("saga", 3, 100)
     # All that was trained is in the layer: rows, and the gate of the head.
     kept = with_info(features, replace(info, details={}))
     assert info.details[LEARNED_BYTES] == learned_bytes(kept, walls.gaussians).layer
@@ -84,7 +79,7 @@ def test_one_training_serves_windows_and_walls(walls) -> None:
 def test_the_published_losses_part_the_walls(walls, guided) -> None:
     """With 2D features and from masks alone; rates raised, as steps are few."""
     published = SagaOptions.published(steps=150, guidance="grids" if guided else None)
-    options = replace(published, grid=16, pixels=256, batch=256)
+    options = replace(published, grid=16)
     features = train_saga(
         walls.gaussians, walls.views, walls.evidence, features=walls.grids if guided else None,
         options=options, context=context(),
@@ -107,41 +102,32 @@ def test_the_published_losses_part_the_walls(walls, guided) -> None:
 @pytest.mark.parametrize(
     "change",
     [
-        {"correspondence": "overlap"},
-        {"guidance_weight": 1.0},
         {"correspondence": "none", "guidance_weight": 1.0},
-        {"correspondence_weight": 0.3},
-        {"unit": False},
-        {"norm_weight": 0.0},
-        {"smoothing": 1},
-        {"smoothing": 9},
-        {"smoothing_drop": 0.0},
-        {"scales": 1},
-        {"max_pixel_weight": 10.0},
+        {"guidance_weight": 1.0},
+        {"start": "normal", "correspondence": "overlap"},
         {"rate": 0.01},
-        {"start": "normal"},
-        {"mask_scale": "size"},
-        {"gate": "random"},
-        {"gate": "steps"},
-        {"gate_rate": 0.1},
-        {"epsilon": 1e-3},
         {"steps": 50},
         {"batch": 100},
-        {"views_per_batch": 2},
-        {"pixels": 150},
-        {"sampling": "uniform"},
-        {"sampling": "uniform", "grid": 9},
-        {"adam": "dense"},
-        {"passes": 1},
-        {"min_weight": 0.3},
-        {"schedule": "constant"},
-        {"final_rate": 0.5},
+        {"grid": 9},
         {"held_out": 0.4},
     ],
     ids=lambda change: "-".join(f"{key}={value}" for key, value in change.items()),
 )
 def test_every_option_changes_what_is_trained(walls, plain, change) -> None:
     assert not torch.equal(trained(walls, **change).values, plain.values)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("model._SCALES", 1), ("model._GATE_RATE", 0.1), ("model._STEEPNESS", 3.0),
+        ("model.HARD_POSITIVE", 0.99), ("model.HARD_NEGATIVE", 0.1), ("options._PIXELS", 150),
+        ("options._VIEWS", 1), ("options._PASSES", 1), ("options._MIN_WEIGHT", 0.3),
+    ],
+)  # fmt: skip
+def test_every_constant_counts(walls, plain, monkeypatch, name, value) -> None:
+    monkeypatch.setattr(f"splatseg.methods.saga.{name}", value)
+    assert not torch.equal(trained(walls).values, plain.values)
 
 
 @pytest.fixture(scope="module")
@@ -153,32 +139,34 @@ def test_memory_changes_nothing(walls, plain) -> None:
     assert torch.equal(trained(walls, memory=0).values, plain.values)
 
 
-def test_the_width_and_what_goes_with_guidance(walls) -> None:
-    assert trained(walls, channels=7).values.shape == (96, 7)
+def test_what_goes_with_guidance(walls, monkeypatch) -> None:
     guided = {"guidance": "grids", "guidance_weight": 1.0}
     first = trained(walls, features=walls.grids, **guided)
     assert not torch.equal(trained(walls, features=None, guidance_weight=1.0).values, first.values)
-    for change in (
-        {"projector_rate": 0.1},
-        {"sparsity_weight": 0.5},
-    ):
-        other = trained(walls, features=walls.grids, **guided, **change)
-        assert not torch.equal(other.values, first.values)
-    tenth = trained(walls, guidance_weight=1.0, sparsity_weight=0.5)
-    half = trained(walls, guidance_weight=1.0, sparsity_weight=0.5, sparsity_share=0.5)
-    assert not torch.equal(tenth.values, half.values)
+    paper = SagaOptions.published(steps=20, guidance="grids")
+
+    def published() -> torch.Tensor:
+        options = replace(paper, grid=8)
+        return train_saga(
+            walls.gaussians, walls.views, walls.evidence, features=walls.grids, options=options,
+            context=context(),
+        ).values  # fmt: skip
+
+    usual = published()
+    for name, value in (("PUBLISHED_RATE", 0.1), ("_SPARSITY_WEIGHT", 0), ("_SPARSITY_SHARE", 0.5)):
+        with monkeypatch.context() as patch:
+            patch.setattr(f"splatseg.methods.saga.model.{name}", value)
+            assert not torch.equal(published(), usual), name
 
 
-def test_early_stopping_keeps_the_best(walls) -> None:
-    features = trained(
-        walls, held_out=0.4, score_every=5, patience=2, steps=200, rate=0.5, schedule="constant"
-    )
-    details = features.info.details
+def test_early_stopping_keeps_the_best(walls, monkeypatch) -> None:
+    monkeypatch.setattr("splatseg.methods.saga.options._SCORE_EVERY", 5)
+    details = trained(walls, held_out=0.4, steps=200, rate=0.5).info.details
     scores = dict(details["scores"])
     assert details["best_step"] == max(scores, key=lambda step: (scores[step], -step))
     assert 0.5 < scores[details["best_step"]] <= 1
-    never = trained(walls, held_out=0.4, score_every=20, patience=0, steps=60)
-    assert never.info.details["best_step"] == 60
+    monkeypatch.setattr("splatseg.methods.saga.options._PATIENCE", 0)
+    assert trained(walls, held_out=0.4).info.details["best_step"] == 60
 
 
 @pytest.mark.bits
@@ -223,8 +211,8 @@ def test_what_was_interrupted_goes_on_to_the_same_bits(walls, plain, tmp_path) -
     again = context(checkpoints=Checkpoints(path=path, resume=True))
     done = train_saga(walls.gaussians, walls.views, walls.evidence, options=options, context=again)
     assert torch.equal(done.values, plain.values)
-    changed = replace(options, scales=2)
-    with pytest.raises(InputError, match="scales"):
+    changed = replace(options, batch=100)
+    with pytest.raises(InputError, match="batch"):
         train_saga(walls.gaussians, walls.views, walls.evidence, options=changed, context=again)
     with pytest.raises(InputError, match="evidence"):
         train_saga(
@@ -235,7 +223,7 @@ def test_what_was_interrupted_goes_on_to_the_same_bits(walls, plain, tmp_path) -
 
 def test_the_published_setting_resumes_to_the_same_bits(walls, tmp_path) -> None:
     """On any number of threads, too."""
-    options = replace(SagaOptions.published(steps=20, guidance="g"), grid=8, pixels=64, batch=64)
+    options = replace(SagaOptions.published(steps=20, guidance="g"), grid=8)
 
     def made(**changes) -> torch.Tensor:
         return train_saga(
@@ -297,25 +285,21 @@ def test_the_published_setting_is_that_of_the_paper() -> None:
     assert options.rate * options.steps == pytest.approx(75.0)
     assert options.steps == SHORT
     for one in (options, paper):
-        assert (one.channels, one.start, one.epsilon, one.adam) == (32, "normal", 1e-15, "dense")
-        assert (one.guidance, one.guidance_weight) == ("any", 1.0)
-        assert (one.correspondence, one.correspondence_weight) == ("overlap", 1.0)
-        assert (one.sparsity_weight, one.sparsity_share) == (0.1, 0.1)
-        assert one.projector_rate == pytest.approx(0.0025)
-        assert (one.grid, one.pixels, one.batch, one.views_per_batch) == (64, 4096, 4096, 1)
-        assert (one.sampling, one.passes, one.min_weight) == ("uniform", 0, 0.0)
-        assert (one.schedule, one.held_out, one.patience) == ("constant", 0.0, 0)
-        assert (one.unit, one.smoothing, one.norm_weight) == (False, 1, 0.0)
+        assert (one.start, one.correspondence, one.grid) == ("normal", "overlap", 64)
+        assert (one.guidance, one.guidance_weight, one.held_out) == ("any", 1.0, 0.0)
+        training, drawing = one.training(), one.drawing()
+        assert (training.adam, training.epsilon, training.batch) == ("dense", 1e-15, 4096)
+        assert (training.schedule, training.passes) == ("constant", 0)
+        assert (drawing.pixels, drawing.sampling) == (4096, "uniform")
+        assert (drawing.views_per_batch, drawing.min_weight) == (1, 0.0)
+    assert (CHANNELS, PUBLISHED_RATE) == (32, 0.0025)
     training = paper.training()
     assert (training.steps, training.adam, training.epsilon) == (30_000, "dense", 1e-15)
-    assert (training.beta1, training.beta2, training.warmup) == (0.9, 0.999, 0)
 
 
 def test_the_published_start_is_normal(walls) -> None:
     """With rates of 0 features stay what they start as: a mean of 0 and a deviation of 1."""
-    options = replace(
-        SagaOptions.published(steps=1, guidance=None), rate=0.0, grid=8, pixels=64, batch=64
-    )
+    options = replace(SagaOptions.published(steps=1, guidance=None), rate=0.0, grid=8)
     values = train_saga(
         walls.gaussians, walls.views, walls.evidence, options=options, context=context()
     ).values
@@ -325,12 +309,12 @@ def test_the_published_start_is_normal(walls) -> None:
 
 
 def test_a_step_has_the_whole_grid_of_one_view_and_moves_all_that_it_shows(walls) -> None:
-    options = replace(SagaOptions.published(steps=1), grid=8, pixels=64, batch=64)
-    source = SagaTargets(walls.evidence, walls.views, first(walls), walls.grids, grid=8)
+    options = replace(SagaOptions.published(steps=1), grid=8)
+    source = SagaTargets(walls.evidence, walls.views, walls.grids, grid=8)
     sampler = RowSampler(
         walls.gaussians, walls.views, source, options=options.drawing(), backend=DRAWN_BY
     )
-    with sampler.draw(np.random.default_rng(0), batch=options.batch) as drawn:
+    with sampler.draw(np.random.default_rng(0), batch=64) as drawn:
         assert len(drawn) == len(walls.views)
         batch = drawn.batch(0)
     assert sorted(batch.pixels.tolist()) == list(range(64))
@@ -350,13 +334,13 @@ def test_a_step_has_the_whole_grid_of_one_view_and_moves_all_that_it_shows(walls
 
 
 def test_cells_have_the_masks_and_features_in_their_middle(walls) -> None:
-    source = SagaTargets(walls.evidence, walls.views, first(walls), walls.grids, grid=8)
+    source = SagaTargets(walls.evidence, walls.views, walls.grids, grid=8)
     choice = source.choice("v1")
     assert (choice.height, choice.width, len(choice.pixels), choice.grid) == (8, 8, 64, True)
     cells = torch.tensor([63, 0, 27, 35, 42])
     found = source.targets("v1", cells)
     masks = walls.evidence.masks("v1")
-    offset = first(walls)["v1"]
+    offset = 4
     for place, cell in enumerate(cells.tolist()):
         row, column = 3 * (cell // 8) + 1, 4 * (cell % 8) + 2
         expected = [offset + i for i in range(len(masks)) if bool(masks.dense(i)[row, column])]
@@ -365,6 +349,38 @@ def test_cells_have_the_masks_and_features_in_their_middle(walls) -> None:
     grid = walls.grids.features("v1").features
     expected = torch.lerp(grid[0, 0], grid[1, 0], 0.0)
     torch.testing.assert_close(found["guidance"][1].float(), expected, atol=0.01, rtol=0.01)
+
+
+def test_targets_are_numbered_through_all_views(walls) -> None:
+    source = SagaTargets(walls.evidence, walls.views, walls.grids)
+    assert source.channels == 4
+    pixels = torch.tensor([12 * WIDTH + 24, 2 * WIDTH + 1])
+    found = source.targets("v1", pixels)
+    assert found["masks"].row(0).tolist() == [5, 7]
+    assert found["masks"].row(1).tolist() == [4]
+    # A pixel at the middle between four cells reads their mean.
+    cells = walls.grids.features("v1").features
+    between = source.targets("v1", torch.tensor([7 * WIDTH + 7]))["guidance"][0]
+    near = [
+        cells[i, j] * a * b
+        for i, a in ((1, 0.625), (2, 0.375))
+        for j, b in ((1, 0.625), (2, 0.375))
+    ]
+    torch.testing.assert_close(between.float(), sum(near), rtol=2e-3, atol=2e-3)
+    assert "guidance" not in SagaTargets(walls.evidence, walls.views).targets("v1", pixels)
+    assert source.fingerprint != SagaTargets(walls.evidence, walls.views).fingerprint
+
+
+def test_pixels_outside_all_masks_are_a_group(walls) -> None:
+    window = Masks(
+        {v.name: MaskSet.from_dense(walls.mask_set(v).dense(2)[None]) for v in walls.views}
+    )
+    source = SagaTargets(window, walls.views)
+    groups = source.groups("v1")
+    assert len(groups) == 2
+    assert len(groups.values) == HEIGHT * WIDTH
+    full = SagaTargets(walls.evidence, walls.views)
+    assert len(full.groups("v1")) == 4
 
 
 def test_guidance_that_was_asked_for_has_to_be_there(walls) -> None:
@@ -381,7 +397,7 @@ def test_the_record_says_which_setting_and_how_the_loss_fell(walls, plain) -> No
     steps, losses = zip(*plain.info.details["loss_curve"], strict=True)
     assert (len(steps), steps[-1]) == (60, 60)
     assert 0 < min(losses) < max(losses)
-    options = replace(SagaOptions.published(steps=3, guidance=None), grid=8, pixels=64, batch=64)
+    options = replace(SagaOptions.published(steps=3, guidance=None), grid=8)
     features = train_saga(
         walls.gaussians, walls.views, walls.evidence, options=options, context=context()
     )
@@ -402,10 +418,6 @@ def test_losses_are_means_of_stretches() -> None:
     assert (len(curve), curve[0], curve[-1]) == (100, [2, 0.5], [200, 198.5])
 
 
-def first(walls) -> dict[str, int]:
-    return {view.name: 4 * i for i, view in enumerate(walls.views)}
-
-
 def render_weights(gaussians, camera) -> torch.Tensor:
     """Gaussians that a view shows at all."""
     pixels = torch.stack(
@@ -419,22 +431,15 @@ def render_weights(gaussians, camera) -> torch.Tensor:
     ("change", "message"),
     [
         ({"correspondence": "some"}, "correspondence: expected"),
-        ({"gate": "some"}, "gate: expected"),
         ({"start": "some"}, "start: expected"),
-        ({"mask_scale": "some"}, "mask_scale: expected"),
-        ({"channels": 0}, "channels: expected at least 1, got 0"),
-        ({"smoothing": 0}, "smoothing: expected at least 1, got 0"),
-        ({"scales": -1}, "scales: expected 0 or more, got -1"),
-        ({"max_pixel_weight": 0.5}, "max_pixel_weight: expected 1 or more"),
-        ({"rate": -1.0}, "rate: expected 0 or more"),
-        ({"smoothing_drop": 1.0}, "smoothing_drop: expected at least 0 and less than 1"),
-        ({"sparsity_share": 0.0}, "sparsity_share: expected above 0"),
+        ({"start": "normal"}, "scale does not go with --start normal"),
+        ({"correspondence": "overlap"}, "overlap does not go with --start association"),
+        ({"rate": -1.0}, "rate: expected at least 0"),
         ({"correspondence": "none"}, "expected one of the two losses, got neither"),
         ({"guidance": "features"}, "guidance_weight: expected above 0"),
-        ({"views_per_batch": 0}, "views_per_batch: expected at least 1"),
-        ({"grid": -1}, "grid: expected 0 or more, got -1"),
-        ({"grid": 8}, "grid: expected --sampling uniform"),
-        ({"adam": "some"}, "adam: expected"),
+        ({"grid": -1}, "grid: expected at least 0, got -1"),
+        ({"held_out": 1.0}, "held_out: expected"),
+        ({"smoothing": 4}, "smoothing: this option was removed"),
     ],
 )
 def test_options_out_of_range_are_refused(change, message) -> None:

@@ -9,20 +9,19 @@ import pytest
 import torch
 
 from splatseg.cli import main
-from splatseg.core import VoxelFeatures
-from splatseg.errors import FileFormatError, InputError, RangeError
+from splatseg.core import StoredTable, VoxelFeatures
+from splatseg.errors import FileFormatError, InputError, RangeError, ShapeError
 from splatseg.io.arrays import save_arrays
 from splatseg.io.evidence import FeatureEvidence, open_evidence
 from splatseg.io.layers import load_layer, save_layer
 from splatseg.io.scene import load_scene, load_scene_layer
 from splatseg.lift.vocabulary import vocabulary_of
-from splatseg.lift.voxels import HitOptions, VoxelWords, surface_points, voxelise
 from splatseg.methods import find_method
 from splatseg.methods.voxels import VoxelOptions
+from splatseg.methods.voxels.words import VoxelWords, products, store
 from splatseg.tasks import SegmentOptions, segment
 
 OPTIONS = VoxelOptions(voxels=600)
-DEPTH = replace(OPTIONS, cells="depth", projection=HitOptions(hits="first"))
 
 
 @pytest.fixture(scope="module")
@@ -42,58 +41,20 @@ def layer(scene) -> VoxelFeatures:
     return made(scene)
 
 
-def test_cells_of_depth_lie_where_views_see_surfaces(scene) -> None:
-    layer = made(scene, DEPTH)
-    points = surface_points(scene.gaussians, scene.train_views)
-    cells = torch.floor((points - layer.grid.origin) / layer.grid.size).int()
-    seen = {tuple(cell) for cell in cells.tolist()}
-    assert {tuple(cell) for cell in layer.grid.cells.tolist()} <= seen
-    assert 200 < len(layer.grid) < 1500
-    assert layer.info.details["hit"] == len(layer.grid)
-    assert len(layer) == len(scene.gaussians)
-    assert layer.table.precision == "float16"
-
-
-def test_points_of_a_view_project_onto_its_pixels(scene) -> None:
-    view = scene.train_views[0]
-    points = surface_points(scene.gaussians, [view], stride=4)
-    pixels, depth = view.camera.project(points)[:2]
-    assert bool((depth > 0).all())
-    off = (pixels - 2.5) % 4
-    assert float(torch.minimum(off, 4 - off).abs().max()) < 1e-3, "every fourth pixel's centre"
-    with pytest.raises(RangeError, match="stride: expected at least 1"):
-        surface_points(scene.gaussians, [view], stride=0)
-    with pytest.raises(InputError, match="pixels that show a surface"):
-        surface_points(scene.gaussians, [])
-
-
-def test_cells_of_few_points_are_left_out() -> None:
-    points = torch.tensor([[0.5, 0.5, 0.5]] * 3 + [[5.5, 0.5, 0.5]] + [[9.5, 0.5, 0.5]] * 2)
-    assert voxelise(points, 1.0).cells[:, 0].tolist() == [0, 5, 9]
-    assert voxelise(points, 1.0, min_points=2).cells[:, 0].tolist() == [0, 9]
-    assert voxelise(points, 1.0, min_points=3).cells[:, 0].tolist() == [0]
-    with pytest.raises(InputError, match="min_points: expected a cell of 4"):
-        voxelise(points, 1.0, min_points=4)
-
-
 @pytest.mark.parametrize(
     "changed",
     [
         {"voxels": 200},
         {"cell": 0.5},
-        {"cells": "depth"},
-        {"min_points": 40, "cells": "depth"},
-        {"projection": HitOptions(hits="first")},
-        {"projection": HitOptions(hits="several")},
-        {"projection": HitOptions(hits="weights")},
+        {"filter": "opaque"},
+        {"hits": "first"},
+        {"hits": "weights"},
         {"precision": "int8"},
-        {"precision": "product", "parts": 2},
+        {"precision": "product"},
     ],
 )
 def test_each_option_makes_a_difference(scene, layer, changed) -> None:
     found = made(scene, replace(OPTIONS, **changed))
-    if "min_points" in changed:
-        layer = made(scene, replace(OPTIONS, cells="depth"))
     same = len(found.grid) == len(layer.grid) and torch.equal(
         found.table.decode(), layer.table.decode()
     )
@@ -102,17 +63,11 @@ def test_each_option_makes_a_difference(scene, layer, changed) -> None:
         assert found.grid.size == 0.5
 
 
-def test_parts_are_bytes_of_a_voxel(scene) -> None:
-    few = made(scene, replace(OPTIONS, precision="product", parts=2)).table
-    more = made(scene, replace(OPTIONS, precision="product", parts=4)).table
-    assert few.codes.shape[1] < more.codes.shape[1] <= 4
-
-
-def test_filtering_counts_where_centres_make_cells(scene) -> None:
-    strict = replace(OPTIONS, filtering=replace(OPTIONS.filtering, scale_share=0.4))
-    assert made(scene, strict).grid.size != made(scene).grid.size
-    depth = replace(DEPTH, filtering=strict.filtering)
-    assert made(scene, depth).grid.size == made(scene, DEPTH).grid.size
+def test_options_that_went_say_what_to_use_instead() -> None:
+    with pytest.raises(InputError, match="cells: this option was removed; cells are made of"):
+        VoxelOptions(cells="depth")
+    with pytest.raises(RangeError, match="voxels: expected at least 1"):
+        VoxelOptions(voxels=0)
 
 
 def test_published_is_the_paper(scene) -> None:
@@ -121,13 +76,7 @@ def test_published_is_the_paper(scene) -> None:
     assert found.grid.size == 0.04
     assert found.table.precision == "float32"
     options = found.info.options
-    assert options["cells"] == "centres"
-    projection, reading = options["projection"], options["assignment"]
-    assert (projection["hits"], projection["average"]) == ("first", "hits")
-    assert (reading["interpolation"], reading["max_distance"]) == ("nearest", None)
-    kept = options["filtering"]
-    assert (kept["opaque_share"], kept["min_neighbours"], kept["radius"]) == (0.5, 4, 0.2)
-    assert (kept["min_opacity"], kept["max_elongation"], kept["scale_share"]) == (None, None, None)
+    assert (options["filter"], options["hits"]) == ("opaque", "first")
     method = find_method("voxels")
     assert (method.words, method.published_words) == ("span", "cosines")
 
@@ -196,3 +145,70 @@ def test_query_answers_from_voxels(fitted_room, tmp_path, capsys) -> None:
     out = capsys.readouterr().out
     assert word in out
     assert load_scene_layer(folder, "found").info.details["words"] == [word]
+
+
+PRECISIONS = ("float32", "float16", "int8", "product")
+
+
+def rows_of(rng, count: int = 700, channels: int = 24) -> torch.Tensor:
+    return torch.from_numpy(rng.normal(size=(count, channels))).float()
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("count", [1, 3, 17])
+def test_products_are_those_of_the_rows_that_were_kept(rng, precision, count) -> None:
+    values = rows_of(rng)
+    vectors = torch.from_numpy(rng.normal(size=(count, 24))).float()
+    table = store(values, precision=precision, parts=8)
+    assert table.precision == precision
+    assert table.channels == 24
+    expected = table.decode().double() @ vectors.double().T
+    found = products(table, vectors)
+    torch.testing.assert_close(found.double(), expected, rtol=0, atol=2e-5)
+
+
+@pytest.mark.parametrize(("precision", "most"), [("float32", 0), ("float16", 2e-3), ("int8", 2e-2)])
+def test_what_is_lost_is_bounded(rng, precision, most) -> None:
+    values = rows_of(rng)
+    lost = (store(values, precision=precision).decode() - values).abs().max()
+    assert float(lost) <= most
+    assert store(values, precision=precision).nbytes < values.nbytes + 1
+
+
+def test_a_product_code_is_the_nearest_of_its_codebook(rng) -> None:
+    values = rows_of(rng, count=400)
+    table = store(values, precision="product", parts=6)
+    assert table.codebooks is not None
+    cut = values.reshape(400, 6, 4)
+    distance = (cut[:, :, None] - table.codebooks[None]).square().sum(dim=-1)
+    taken = distance.gather(2, table.codes.long()[..., None]).squeeze(-1)
+    torch.testing.assert_close(taken, distance.amin(dim=2), rtol=1e-4, atol=1e-5)
+    assert table.nbytes == 400 * 6 + table.codebooks.nbytes
+    again = store(values, precision="product", parts=6)
+    assert torch.equal(again.codes, table.codes)
+    other = store(values, precision="product", parts=6, seed=1)
+    assert not torch.equal(other.codebooks, table.codebooks)
+
+
+def test_few_distinct_rows_are_kept_without_loss(rng) -> None:
+    distinct = rows_of(rng, count=40)
+    values = distinct[torch.from_numpy(rng.integers(0, 40, 900))]
+    table = store(values, precision="product", parts=24)
+    # More vectors than distinct rows: k-means ends on the rows themselves where it begins on them.
+    assert float((table.decode() - values).square().mean()) < 0.01
+
+
+def test_bad_tables(rng) -> None:
+    values = rows_of(rng, count=5)
+    with pytest.raises(RangeError, match="float16, got 1e\\+06"):
+        store(values * 0 + 1e6, precision="float16")
+    with pytest.raises(RangeError, match="parts: expected at least 1"):
+        store(values, precision="product", parts=0)
+    with pytest.raises(RangeError):
+        store(values * float("nan"))
+    with pytest.raises(ShapeError):
+        products(store(values), torch.zeros(2, 7))
+    with pytest.raises(InputError, match="scales: expected them with codes of int8"):
+        StoredTable(codes=values, scales=torch.ones(5))
+    with pytest.raises(InputError, match="codes: expected float32"):
+        StoredTable(codes=values.double())

@@ -4,9 +4,9 @@ Labels of views contradict each other: a segmenter is wrong about an object from
 views. Numbers of each Gaussian's own learn that by heart; a small network that is given what
 Gaussians look like and how they lie in space cannot, and gives alike things one label.
 
-Features of four blocks of a network are unprojected onto Gaussians (`_distilled`, eq. 2), a frozen
-RandLA-Net encodes their centres (`lift.point_network`), and a decoder fuses both from far to near
-(`_fusion`, Figs. 3 and 4). It is trained so that pixels get the labels of their label maps:
+Features of four blocks of a network are unprojected onto Gaussians (`features`, eq. 2), a frozen
+RandLA-Net encodes their centres (`network`), and a decoder fuses both from far to near (`decoder`,
+Figs. 3 and 4). It is trained so that pixels get the labels of their label maps:
 
 .. math:: \ell_s = -\sum_p \log \mathrm{softmax}(A \sum_i w_{pi} h_i + b)_{\mathrm{id}(p)}
 
@@ -18,54 +18,101 @@ References:
     Hu et al., RandLA-Net: Efficient Semantic Segmentation of Large-Scale Point Clouds (2020).
 """
 
-from collections.abc import Callable
-from functools import partial
-from typing import TypeVar
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
 
-from splatseg.core import Layer
+from splatseg.core import InstanceTree, Labels, LabelSource, Layer
+from splatseg.io.evidence import TrackedEvidence
+from splatseg.lift.segments.matching import MatchedMaps
+from splatseg.lift.segments.recorded import EvidenceSegments
 from splatseg.methods._method import Method, MethodInputs, Refined
 from splatseg.methods._trained_labels import context_of, hard_labels
-from splatseg.methods.cosseg._blocks import BlockSource as BlockSource
-from splatseg.methods.cosseg._distilled import distilled_features as distilled_features
-from splatseg.methods.cosseg._linked import LinkedLabels, linked_labels
-from splatseg.methods.cosseg._options import PUBLISHED_DIFFERS
-from splatseg.methods.cosseg._options import CossegOptions as CossegOptions
-from splatseg.methods.cosseg._train import train_cosseg as train_cosseg
-from splatseg.methods.cosseg._train_jointly import train_cosseg_jointly as train_cosseg_jointly
+from splatseg.methods.associate import associate
+from splatseg.methods.cosseg.features import BlockSource as BlockSource
+from splatseg.methods.cosseg.features import distilled_features as distilled_features
+from splatseg.methods.cosseg.joint import train_cosseg_jointly as train_cosseg_jointly
+from splatseg.methods.cosseg.options import PUBLISHED_DIFFERS
+from splatseg.methods.cosseg.options import CossegOptions as CossegOptions
+from splatseg.methods.cosseg.train import train_cosseg as train_cosseg
 
-_Made = TypeVar("_Made")
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LinkedLabels:
+    """Label maps whose ids mean the same in all views, and what class each is of."""
+
+    source: LabelSource
+    class_of: Mapping[int, int] = field(default_factory=dict[int, int])
+    """Of ids that are of objects the class, where it is known."""
+
+    names: Mapping[int, str] = field(default_factory=dict[int, str])
+
+    def described(self, labels: Labels) -> Labels:
+        """The layer, with what its ids are of."""
+        if not self.class_of:
+            return labels
+        present = set(labels.present.tolist())
+        info = replace(
+            labels.info,
+            class_of={id: kind for id, kind in self.class_of.items() if id in present},
+            names={id: name for id, name in self.names.items() if id in present},
+        )
+        return replace(labels, info=info)
+
+
+def linked_labels(inputs: MethodInputs) -> LinkedLabels:
+    """Label maps of classes or tracks as they are; panoptic segments are associated to objects."""
+    evidence = inputs.evidence
+    if evidence.kind == "labels":
+        return LinkedLabels(source=evidence)
+    segments = EvidenceSegments(evidence=evidence)
+    if isinstance(evidence, TrackedEvidence):
+        class_of = dict(segments.categories_of(""))
+        kinds = {} if inputs.categories is None else {r.id: r.name for r in inputs.categories.rows}
+        names = {id: f"{kinds.get(kind, kind)} {id}" for id, kind in class_of.items()}
+        return LinkedLabels(source=evidence, class_of=class_of, names=names)
+    objects = associate(
+        inputs.gaussians,
+        inputs.views,
+        segments,
+        classes=inputs.categories,
+        backend=inputs.backend,
+    )
+    flat = objects.cut("object") if isinstance(objects, InstanceTree) else objects
+    return LinkedLabels(
+        source=MatchedMaps(
+            gaussians=inputs.gaussians,
+            views=inputs.views,
+            source=segments,
+            labels=flat,
+            backend=inputs.backend,
+        ),
+        class_of=flat.info.class_of,
+        names=flat.info.names,
+    )
 
 
 def run(inputs: MethodInputs, options: CossegOptions) -> Layer | Refined:
     """Train the decoder and read it, as the options say."""
-    linked = linked_labels(inputs, options.link)
+    linked = linked_labels(inputs)
+    scene = inputs.gaussians, inputs.views, linked.source
+    given: dict[str, Any] = {
+        "features": inputs.features("features"),
+        "options": options,
+        "classes": inputs.label_names,
+        "metres_per_unit": inputs.metres_per_unit,
+        "up": inputs.up,
+        "context": context_of(inputs),
+    }
     gaussians = None
     if options.joint is None:
-        found = _trained(train_cosseg, inputs, linked, options)
+        found = train_cosseg(*scene, **given)
     else:
-        train = partial(train_cosseg_jointly, told=inputs.progress)
-        gaussians, found = _trained(train, inputs, linked, options)
+        gaussians, found = train_cosseg_jointly(*scene, **given, progress=inputs.progress)
     layer: Layer = found
     if options.readout == "hard":
-        layer = linked.told(hard_labels(found, options))
+        layer = linked.described(hard_labels(found, options))
     return layer if gaussians is None else Refined(layer=layer, gaussians=gaussians)
-
-
-def _trained(
-    train: Callable[..., _Made], inputs: MethodInputs, linked: LinkedLabels, options: CossegOptions
-) -> _Made:
-    """What a training makes of the inputs."""
-    return train(
-        inputs.gaussians,
-        inputs.views,
-        linked.source,
-        features=inputs.features("features"),
-        options=options,
-        classes=inputs.label_names,
-        metres_per_unit=inputs.metres_per_unit,
-        up=inputs.up,
-        context=context_of(inputs),
-    )
 
 
 METHOD = Method(

@@ -21,15 +21,15 @@ from splatseg.core.models import GroundedMasks, TextFeatures
 from splatseg.errors import InputError
 from splatseg.io.evidence import FeatureEvidence
 from splatseg.methods._method import Method, MethodInputs
-from splatseg.methods.prompt._groups import FoundObject as FoundObject
-from splatseg.methods.prompt._options import PUBLISHED as PUBLISHED
-from splatseg.methods.prompt._options import PromptOptions as PromptOptions
-from splatseg.methods.prompt._points import points_inside
-from splatseg.methods.prompt._session import Prompted as Prompted
-from splatseg.methods.prompt._session import PromptedObject as PromptedObject
-from splatseg.methods.prompt._session import PromptSession as PromptSession
-from splatseg.methods.prompt._session import PromptSources as PromptSources
-from splatseg.methods.prompt._views import initial_views as initial_views
+from splatseg.methods.prompt.options import PUBLISHED as PUBLISHED
+from splatseg.methods.prompt.options import PromptOptions as PromptOptions
+from splatseg.methods.prompt.session import Prompted as Prompted
+from splatseg.methods.prompt.session import PromptedObject as PromptedObject
+from splatseg.methods.prompt.session import PromptSession as PromptSession
+from splatseg.methods.prompt.session import PromptSources as PromptSources
+from splatseg.methods.prompt.views import initial_views as initial_views
+from splatseg.methods.prompt.views import points_inside
+from splatseg.methods.prompt.words import FoundObject as FoundObject
 
 
 def parsed_points(texts: tuple[str, ...]) -> list[tuple[str, float, float]]:

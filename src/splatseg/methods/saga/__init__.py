@@ -15,8 +15,8 @@ mean of what is rendered in it.
 
 By default features are directions and are compared behind a gate of the scale that is looked for,
 so that one training serves parts, objects and groups: at a scale, pixels belong together that share
-a mask up to it (`_losses.together_at`). The masks are associated first (`methods.associate`):
-features start as codes of the nodes that Gaussians are in (`_association`), the scale of a mask is
+a mask up to it (`model.together_at`). The masks are associated first (`methods.associate`):
+features start as codes of the nodes that Gaussians are in (`masks`), the scale of a mask is
 the level of its node, and training is kept as far as it makes held-out views better. Decision 0030.
 
 References:
@@ -28,14 +28,13 @@ from dataclasses import replace
 
 from splatseg.core import Features, InstanceTree
 from splatseg.lift.affinity import AffinityHead
-from splatseg.lift.decomposition.decompose import decompose
-from splatseg.lift.decomposition.options import DecomposeOptions
 from splatseg.methods._method import Method, MethodInputs
 from splatseg.methods._trained_labels import context_of
-from splatseg.methods.saga._options import SHORT_STEPS
-from splatseg.methods.saga._options import SagaOptions as SagaOptions
-from splatseg.methods.saga._options import trained_as_published as trained_as_published
-from splatseg.methods.saga._train import train_saga as train_saga
+from splatseg.methods.saga.decomposition import DecomposeOptions, decompose
+from splatseg.methods.saga.options import SHORT_STEPS
+from splatseg.methods.saga.options import SagaOptions as SagaOptions
+from splatseg.methods.saga.options import trained_as_published as trained_as_published
+from splatseg.methods.saga.train import train_saga as train_saga
 
 PUBLISHED_DIFFERS = (
     f"It differs: {SHORT_STEPS} steps where the paper has 30 000, at {30_000 // SHORT_STEPS} times "

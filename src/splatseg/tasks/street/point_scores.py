@@ -18,7 +18,7 @@ from splatseg.core import (
 from splatseg.core.boundary import boundary
 from splatseg.evaluate import Confusion, semantic_score, street_class
 from splatseg.io.depths import depth_kind
-from splatseg.lift.points import points_in_sight
+from splatseg.lift.viewed_points import points_in_sight
 from splatseg.report.street_report import PointScore
 from splatseg.street.depth_views import DepthView, capture_views, field_views
 

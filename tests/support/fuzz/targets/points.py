@@ -5,16 +5,14 @@ from pathlib import Path
 
 import torch
 
-from splatseg.lift.point_network import (
-    PointInputs,
-    RandlaConfig,
-    RandlaEncoder,
-    RandlaNet,
+from splatseg.methods.cosseg.checkpoint import (
     load_point_encoder,
     load_point_network,
     save_point_encoder,
     save_point_network,
 )
+from splatseg.methods.cosseg.network import RandlaEncoder, RandlaNet
+from splatseg.methods.cosseg.pyramid import PointInputs, RandlaConfig
 from support.fuzz.targets.base import Target, target
 
 CONFIG = RandlaConfig(inputs=3, first_width=2, widths=(2,), neighbours=2, ratios=(2,), classes=2)

@@ -1,1 +1,0 @@
-"""Affinity features to a tree of instances, without a prompt."""
