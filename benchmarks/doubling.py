@@ -38,9 +38,9 @@ from splatseg.lift.pipeline import lift_labels
 from splatseg.methods.associate import associate
 from splatseg.render import render
 from splatseg.tasks.edit import edit_scene
-from splatseg.tasks.edit_options import EditOptions
+from splatseg.tasks.edit_operations import EditOptions
 from splatseg.tasks.export import export_scene
-from splatseg.tasks.export_options import ExportOptions
+from splatseg.tasks.export_labels import ExportOptions
 
 BASE = {"masks": 60, "views": 12, "gaussians": 20_000, "ids": 50}
 """What does not double is so."""

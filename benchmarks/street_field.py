@@ -55,14 +55,15 @@ from splatseg.street.radiance import (
 )
 from splatseg.street.shapes import load_shapes
 from splatseg.tasks.render_truth import scene_of_views
-from splatseg.tasks.street._sources import capture_points, drive_sources
+from splatseg.tasks.street_inputs import capture_points, drive_sources
+from splatseg.tasks.work import Work
 
 
 def fitted_mesh(scene: Scene, views: tuple[View, ...], depth: str, steps: int) -> PrimitiveMesh:
     shapes = load_shapes()
     sources = drive_sources(
-        scene, views, depth=depth, scans=read_scans(scene.source), cell=0.1, backend="cpu",
-        points=capture_points(scene.source),
+        Work(scene=scene, backend="cpu"), views, depth=depth, scans=read_scans(scene.source),
+        cell=0.1, points=capture_points(scene.source),
     )  # fmt: skip
     primitives = voxel_primitives(sources.points, shapes=shapes)
     print(f"{sources.said}; primitives by level {torch.bincount(primitives.levels).tolist()}")

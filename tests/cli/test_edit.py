@@ -335,7 +335,7 @@ def test_pictures_before_and_after(room, tmp_path, capsys) -> None:
 
 
 def test_growth_by_splitting_is_said(room, tmp_path, capsys) -> None:
-    thing = ["--remove", "--layer", "objects", "--names", "thing", "--measure", 0]
+    thing = ["--remove", "--layer", "objects", "--names", "thing", "--pictures", 0]
     assert run(room, tmp_path / "split", *thing) == 0
     said = " ".join(capsys.readouterr().out.split())
     (edit,) = history(tmp_path / "split")

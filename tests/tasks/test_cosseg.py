@@ -18,8 +18,7 @@ from splatseg.lift.point_network import (
     save_point_encoder,
 )
 from splatseg.methods.cosseg import CossegOptions
-from splatseg.tasks.segment import segment
-from splatseg.tasks.segment_options import SegmentOptions
+from splatseg.tasks.segment import SegmentOptions, segment
 from support.checkpoints import saved
 
 LABELS = SegmentOptions(evidence="labels_semantic")

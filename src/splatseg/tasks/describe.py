@@ -31,8 +31,7 @@ from splatseg.io.scene import load_scene, load_scene_layer, scene_layer_names
 from splatseg.io.scene_fields import DRIVE_FILE, scene_field_names, scene_field_path
 from splatseg.io.scene_folder import CHECKPOINT_FILE, is_scene, is_unfinished, training_files
 from splatseg.io.splats import SplatWarning, Values, read_splats, splat_format, trained_splats
-from splatseg.tasks.stopped_fit import where_it_stopped
-from splatseg.tasks.stopped_training import where_training_stopped
+from splatseg.tasks.checkpoints import where_it_stopped, where_training_stopped
 
 _LAYOUTS = ("auto", *FORMATS)
 _CAPTURE_FILES = (

@@ -2,12 +2,15 @@
 
 import warnings
 from dataclasses import dataclass
-from importlib import metadata
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+from msgspec import Meta
 
 from splatseg.core import Capture, Gaussians, Scene
-from splatseg.core.boundary import boundary, convert_fields
+from splatseg.core.boundary import boundary
+from splatseg.core.options import Count
+from splatseg.core.options import options as options_class
 from splatseg.errors import InputError
 from splatseg.importing import Alignment, VirtualViews, align, place_cameras
 from splatseg.io.captures import read_capture
@@ -15,58 +18,56 @@ from splatseg.io.paths import check_utf8
 from splatseg.io.scene import save_scene
 from splatseg.io.splats import SplatWarning, Values, read_splats, splat_format
 from splatseg.render import BackendName
-from splatseg.tasks._observer import SILENT, Observer
-from splatseg.tasks.new_scene import check_replaceable_scene
+from splatseg.tasks.work import (
+    SILENT,
+    Observer,
+    check_replaceable_scene,
+    scene_of_capture,
+    versions,
+)
 
 UpAxis = Literal["auto", "+x", "-x", "+y", "-y", "+z", "-z"]
 """An axis of the file's frame; auto is what its format usually has."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@options_class(removed={"height": "virtual views are three quarters as high as wide"})
 class ImportOptions:
-    """How a file finds its photographs, or its virtual cameras."""
+    """Photographs of a splat file, or its virtual cameras."""
 
     data: Path | None = None
-    """The capture that the splats were made from. None places virtual cameras."""
+    """The capture that the splats were made from: photographs with poses. None places virtual
+    cameras."""
 
     format: str = "auto"
-    """How the capture is read: auto, or one of `io.captures.FORMATS`."""
+    """Layout of the capture: auto, or one of `io.captures.FORMATS`."""
 
     as_is: bool = False
-    """Take the file as it stands, without comparing it with the photographs."""
+    """Do not compare the file with the photographs, and do not move it."""
 
     strict: bool = False
     """Refuse a file with Gaussians that cannot be rendered, and a capture that lists a photograph
     which is not there; see `read_splats` and `read_capture`."""
 
     linear: tuple[Values, ...] = ()
-    """Which of scales and opacities a PLY file has as they are, where 3DGS has logs and logits."""
+    """Values of a PLY file that are stored as they are, where 3DGS stores logs and logits: scales,
+    opacities."""
 
     up: UpAxis = "auto"
-    """Which way is up, where there is no capture. auto: +y for glTF, -y for all else."""
+    """Up axis, where there is no capture. auto: +y for glTF, -y for all other formats, as most
+    tools write them."""
 
-    max_views: int | None = None
-    """Most virtual cameras to place; None takes 40 around an object and 96 within a room. Every
+    max_views: Count | None = None
+    """Largest number of virtual cameras. None takes 40 around an object and 96 within a room. Every
     eighth is a test view."""
 
-    width: int = 800
-    """Width of the virtual views, pixels."""
-
-    height: int = 600
-    """Height of the virtual views, pixels."""
+    width: Annotated[int, Meta(ge=16)] = 800
+    """Width of the virtual views, pixels; they are three quarters as high."""
 
     kind: Literal["auto", "object", "room"] = "auto"
-    """Whether virtual cameras stand around the scene or within it. auto: within, where the
-    scene surrounds them."""
+    """Placement of virtual cameras: around the scene (object) or within it (room). auto: within,
+    where the scene surrounds them."""
 
     def __post_init__(self) -> None:
-        convert_fields(self)
-        if self.max_views is not None and self.max_views < 1:
-            raise InputError(f"max_views: expected at least 1, got {self.max_views}.")
-        if min(self.width, self.height) < 16:
-            raise InputError(
-                f"width, height: expected at least 16 pixels, got {self.width} and {self.height}."
-            )
         if self.as_is and self.data is None:
             raise InputError("as_is: goes with `data`, which says what the file is compared with.")
 
@@ -103,7 +104,7 @@ def import_scene(
         folder: The scene folder to write. A scene that is there is replaced unless it has
             layers.
         options: The capture, or how cameras are placed.
-        backend: Who renders.
+        backend: Rendering backend.
         observer: Is told of the progress and of what was found.
 
     Raises:
@@ -136,7 +137,7 @@ def import_scene(
                 up=up,
                 count=options.max_views,
                 width=options.width,
-                height=options.height,
+                height=options.width * 3 // 4,
                 kind=None if options.kind == "auto" else options.kind,
                 backend=backend,
                 progress=step,
@@ -157,7 +158,7 @@ def _provenance(file: Path, backend: str) -> dict[str, Any]:
         "file": file.name,
         "format": splat_format(file),
         "backend": backend,
-        "versions": {name: metadata.version(name) for name in ("splatseg", "torch")},
+        "versions": versions("splatseg", "torch"),
     }
 
 
@@ -181,15 +182,8 @@ def _with_photographs(
 ) -> Scene:
     if found is not None and found.moved:
         gaussians = gaussians.transformed(found.capture_from_file)
-    return Scene(
-        gaussians=gaussians,
-        views=capture.views,
-        classes=capture.classes,
-        up=capture.up,
-        metres_per_unit=capture.metres_per_unit,
-        source=capture.path,
-        provenance=provenance | _alignment_facts(found, capture),
-    )
+    facts = provenance | _alignment_facts(found, capture)
+    return scene_of_capture(capture, gaussians, provenance=facts)
 
 
 def _with_cameras(

@@ -18,8 +18,8 @@ from splatseg.core import (
 from splatseg.core.boundary import boundary
 from splatseg.evaluate import PointSurfaceOptions, SurfaceField
 from splatseg.io.surfaces import read_surface
-from splatseg.tasks._observer import SILENT, Observer
 from splatseg.tasks.render import Rendering, RenderingOptions, render_views
+from splatseg.tasks.work import SILENT, Observer, scene_of_capture
 
 _NO_CLASSES = re.compile(r"instance|object|part|segment|track", re.IGNORECASE)
 """Names of labels that are no classes, so that the class table does not name them."""
@@ -82,17 +82,11 @@ def _info(name: str, ids: Tensor, *, source_ids: bool) -> LayerInfo:
 def scene_of_views(capture: Capture) -> Scene:
     """The views of a capture, without Gaussians."""
     none = torch.zeros(0, 3)
-    return Scene(
-        gaussians=Gaussians(
-            means=none,
-            rotations=torch.zeros(0, 4),
-            scales=none,
-            opacities=torch.zeros(0),
-            sh=torch.zeros(0, 1, 3),
-        ),
-        views=capture.views,
-        classes=capture.classes,
-        up=capture.up,
-        metres_per_unit=capture.metres_per_unit,
-        source=capture.path,
+    gaussians = Gaussians(
+        means=none,
+        rotations=torch.zeros(0, 4),
+        scales=none,
+        opacities=torch.zeros(0),
+        sh=torch.zeros(0, 1, 3),
     )
+    return scene_of_capture(capture, gaussians)

@@ -3,6 +3,7 @@
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -29,11 +30,10 @@ from splatseg.lift import GaussianField
 from splatseg.lift.affinity import AffinityHead
 from splatseg.methods import Method, MethodInputs, _registry, register_method
 from splatseg.methods.uplift import UpliftMethodOptions
-from splatseg.tasks import select_session
-from splatseg.tasks._select_sources import Offer, OpenedSource, open_source
 from splatseg.tasks.benchmark import BenchOptions, BenchRun, bench
 from splatseg.tasks.benchmark.chosen import BySelection
 from splatseg.tasks.benchmark.prompts import stroke_prompt
+from splatseg.tasks.sources import Offer, OpenedSource, open_source
 from support.red_square import NAMES, SIZE, camera, save_strokes, wall
 
 SQUARE, WALL, ALL = 2, 3, 1
@@ -152,7 +152,7 @@ def test_features_trained_as_published_answer_as_published(
         asked.append((found.rule, found.published))
         return found
 
-    monkeypatch.setattr(select_session, "open_source", opened)
+    monkeypatch.setattr(import_module("splatseg.tasks.select"), "open_source", opened)
     for layer in (affinity, published):
         assert run(protocol, layer).methods[0].scores["iou"] > 0.3
     assert asked == [("fixed", False), ("adaptive", True)]

@@ -23,7 +23,7 @@ from splatseg.methods import Method, register_method, uplift
 from splatseg.methods import _registry as registry
 from splatseg.tasks.benchmark import BenchOptions, BenchRun, bench, bench_table, load_result
 from splatseg.tasks.benchmark.fits import scans_of
-from splatseg.tasks.scene_parts import scene_field
+from splatseg.tasks.work import scene_field
 from support.benchmark_layouts import read_source, write_layout
 from support.benchmark_layouts.evidence import write_evidence
 

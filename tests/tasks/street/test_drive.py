@@ -29,8 +29,8 @@ from splatseg.tasks import (
     open_drive,
     street_field,
 )
-from splatseg.tasks.scene_parts import scene_field
-from splatseg.tasks.street.drive import street_drive
+from splatseg.tasks.street_drive import street_drive
+from splatseg.tasks.work import scene_field
 from support.arrays import arrays_of
 from support.observers import Stopping
 
@@ -351,9 +351,12 @@ def test_a_broken_table_is_one_sentence(filled, options) -> None:
 @pytest.mark.parametrize(
     ("values", "words"),
     [
-        ({"block_length": 10, "block_overlap": 10}, "^block_overlap: expected less than a block"),
-        ({"block_length": 0}, "^block_length: expected a positive number of metres, got 0"),
-        ({"block_length": 9, "block_overlap": -1}, "^block_overlap: expected a positive number"),
+        (
+            {"block_length": 10, "block_overlap": 10},
+            "^block_overlap: expected less than 10 m",
+        ),
+        ({"block_length": 0}, "^block_length: expected more than 0, got 0"),
+        ({"block_length": 9, "block_overlap": -1}, "^block_overlap: expected more than 0"),
         ({"block_overlap": 5}, "^block_overlap: expected a length of blocks with it, got 5 m"),
     ],
 )

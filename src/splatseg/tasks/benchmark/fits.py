@@ -25,10 +25,10 @@ from splatseg.io.scans import scan_formats
 from splatseg.io.scene import load_scene
 from splatseg.io.scene_folder import CHECKPOINT_FILE, is_scene
 from splatseg.render import BackendName
-from splatseg.tasks._observer import Observer
 from splatseg.tasks.benchmark.options import BenchOptions
 from splatseg.tasks.benchmark.walks import walk_splits
 from splatseg.tasks.make_scene import MakeSceneOptions, fit_capture
+from splatseg.tasks.work import Observer
 
 SCENES_FOLDER = "scenes"
 
@@ -66,7 +66,6 @@ def fitted_scene(
             capture,
             folder,
             options=MakeSceneOptions(
-                preset=options.preset,
                 resume=(folder / CHECKPOINT_FILE).is_file(),
                 scans=scans,
             ),

@@ -12,11 +12,10 @@ from splatseg.errors import InputError
 from splatseg.evaluate.protocols import Protocol
 from splatseg.methods import Method
 from splatseg.render import BackendName
-from splatseg.tasks._observer import Observer
 from splatseg.tasks.benchmark.options import BenchOptions
 from splatseg.tasks.benchmark.sight import Seen, companion_for, kinds_wanted, seen_for
-from splatseg.tasks.segment import segment
-from splatseg.tasks.segment_options import SegmentOptions
+from splatseg.tasks.segment import SegmentOptions, segment
+from splatseg.tasks.work import Observer
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

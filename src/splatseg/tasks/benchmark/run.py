@@ -26,7 +26,6 @@ from splatseg.io.paths import path_inside
 from splatseg.io.write_errors import named_write_failures
 from splatseg.methods import find_method
 from splatseg.render import BackendName
-from splatseg.tasks._observer import SILENT, Observer
 from splatseg.tasks.benchmark.fits import fitted_scene, gaussians_digest
 from splatseg.tasks.benchmark.job import Job
 from splatseg.tasks.benchmark.maps import map_scores
@@ -56,7 +55,7 @@ from splatseg.tasks.benchmark.sight import (
 )
 from splatseg.tasks.benchmark.streets import Drive, point_rules
 from splatseg.tasks.benchmark.targets import TargetRun
-from splatseg.tasks.new_scene import check_parent_writable
+from splatseg.tasks.work import SILENT, Observer, check_parent_writable
 
 _Scorer = Callable[[Job], tuple[dict[str, float], Sequence[Mapping[str, Any]], list[str]]]
 """Scores, rows and notes of a job."""

@@ -9,9 +9,8 @@ from splatseg.lift import GaussianField
 from splatseg.lift.affinity import KIND
 from splatseg.prompting.prompts import ViewPrompt
 from splatseg.tasks.benchmark.job import Job
-from splatseg.tasks.select import open_selector
-from splatseg.tasks.select_options import SelectOptions
-from splatseg.tasks.select_session import SelectionSession
+from splatseg.tasks.select import SelectionSession, open_selector
+from splatseg.tasks.sources import SelectOptions
 
 _LAYER = "layer"
 

@@ -47,8 +47,8 @@ from splatseg.tasks.benchmark.maps import Scores, TrueMapSource, class_scores, k
 from splatseg.tasks.benchmark.points import read_by_words, read_in_words
 from splatseg.tasks.benchmark.sight import Seen, evidence_wanted
 from splatseg.tasks.scan_labels import viewed_points
-from splatseg.tasks.street.field import save_street_field, street_field
-from splatseg.tasks.street.options import StreetOptions
+from splatseg.tasks.street_field import save_street_field, street_field
+from splatseg.tasks.street_inputs import StreetOptions
 
 _LAYER = "layer"
 _OF_GAUSSIANS = ("views", "density", "region", "fair")

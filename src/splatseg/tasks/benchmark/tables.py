@@ -10,7 +10,7 @@ from splatseg.io.paths import path_inside
 from splatseg.report.html import Commands, Notice, Report, Table, report_html
 from splatseg.tasks.benchmark.results import MethodResult, switches_of
 from splatseg.tasks.benchmark.run import BenchRun
-from splatseg.tasks.score_tables import Cell, write_table
+from splatseg.tasks.figures import Cell, write_table
 
 MEASURED = "measured here"
 _UNVERIFIED = " (not verified)"
