@@ -54,9 +54,8 @@ from splatseg.street.radiance import (
     train_radiance,
 )
 from splatseg.street.shapes import load_shapes
-from splatseg.tasks.render_truth import scene_of_views
 from splatseg.tasks.street_inputs import capture_points, drive_sources
-from splatseg.tasks.work import Work
+from splatseg.tasks.work import Work, scene_of_capture
 
 
 def fitted_mesh(scene: Scene, views: tuple[View, ...], depth: str, steps: int) -> PrimitiveMesh:
@@ -150,7 +149,7 @@ def main() -> None:
                 sizes=tuple(kept["sizes"].tolist()),
             )
     else:
-        scene = scene_of_views(capture) if args.scene is None else load_scene(args.scene)
+        scene = scene_of_capture(capture) if args.scene is None else load_scene(args.scene)
         scene = replace(scene, source=args.data.resolve())
         mesh = fitted_mesh(scene, capture.train_views, args.depth, args.geometry)
         if args.mesh is not None:

@@ -23,9 +23,9 @@ from .import_scene import ImportedScene as ImportedScene
 from .import_scene import ImportOptions as ImportOptions
 from .import_scene import import_scene as import_scene
 from .make_scene import MadeScene as MadeScene
-from .make_scene import MakeSceneOptions as MakeSceneOptions
 from .make_scene import fit_capture as fit_capture
 from .photographs import Examination as Examination
+from .photographs import MakeSceneOptions as MakeSceneOptions
 from .photographs import examine_capture as examine_capture
 from .pictures import check_selection_file as check_selection_file
 from .pictures import draw_answers as draw_answers
@@ -39,8 +39,8 @@ from .query import QuerySession as QuerySession
 from .query import query as query
 from .render import Rendering as Rendering
 from .render import RenderingOptions as RenderingOptions
+from .render import render_truth as render_truth
 from .render import render_views as render_views
-from .render_truth import render_truth as render_truth
 from .scan_labels import LabelBy as LabelBy
 from .scan_labels import ScanLabelOptions as ScanLabelOptions
 from .scan_labels import ScanLabels as ScanLabels

@@ -36,7 +36,7 @@ from splatseg.tasks.edit_operations import (
     operations_of,
     where_of,
 )
-from splatseg.tasks.work import REPORTS_FOLDER, SILENT, Observer, check_new_folder, write_page
+from splatseg.tasks.work import REPORTS_FOLDER, SILENT, Observer, Work, check_new_folder, write_page
 
 _ASKED_VIEWS = 24
 """Views that are looked at, small, to find those that change most."""
@@ -204,7 +204,7 @@ def edit_scene(
         MissingFileError: If another scene that is needed is not there.
     """
     check_new_folder(folder)
-    root = _root(document)
+    root = Work(scene=document.scene).root
     if options.undo:
         after, done = _undone(root, document, data, backend, observer)
     else:
@@ -235,12 +235,6 @@ class _Work:
     cut: Cut
     backend: BackendName
     observer: Observer
-
-
-def _root(document: Document) -> Path:
-    if document.scene.root is None:
-        raise InputError("document: expected a scene read from its folder, got one without.")
-    return document.scene.root
 
 
 def _edited(work: _Work, document: Document) -> tuple[Document, list[Mapping[str, Any]]]:

@@ -8,14 +8,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from torch import Tensor
 
 from splatseg.core import (
-    Gaussians,
     Labels,
     LayerInfo,
     Similarity,
-    View,
 )
 from splatseg.core.options import Natural
 from splatseg.core.options import options as options_class
@@ -277,7 +274,9 @@ def measured_change(before: Document, split: Document, *, backend: BackendName) 
     pairs = (before.scene.gaussians, split.scene.gaussians)
     squares = 0.0
     for view in spaced:
-        first, second = (_image(gaussians, view, backend) for gaussians in pairs)
+        first, second = (
+            render(gaussians, view.camera, backend=backend).image.clamp(0, 1) for gaussians in pairs
+        )
         squares += float(((first - second) ** 2).mean()) / len(spaced)
     found = {"split_psnr": -10 * math.log10(max(squares, 1e-12))}
     if len(photographed(spaced)) == len(spaced):
@@ -288,10 +287,6 @@ def measured_change(before: Document, split: Document, *, backend: BackendName) 
             ]
             found[name] = math.fsum(scores) / len(scores)
     return {name: round(value, 3) for name, value in found.items()} | {"views": len(spaced)}
-
-
-def _image(gaussians: Gaussians, view: View, backend: str) -> Tensor:
-    return render(gaussians, view.camera, backend=backend).image.clamp(0, 1)
 
 
 def where_of(options: EditOptions, document: Document) -> Where | None:

@@ -1,6 +1,7 @@
 """A splat file of any tool becomes a scene, with its photographs or with virtual cameras."""
 
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -118,48 +119,76 @@ def import_scene(
     gaussians = read_with_notes(file, observer, strict=options.strict, linear=options.linear)
     if not len(gaussians):
         raise InputError(f"{file}: expected Gaussians, got a file of none.")
-    provenance = _provenance(file, backend)
-    alignment, placed = None, None
-    if options.data is not None:
-        capture = read_capture(options.data, format=options.format, strict=options.strict)
-        for note in capture.notes:
-            observer.note(note)
-        if not options.as_is:
-            alignment = align(gaussians, capture, splats=file, backend=backend)
-            observer.info(_aligned(alignment))
-        scene = _with_photographs(gaussians, capture, alignment, provenance)
-    else:
-        axis = _up_axis(file) if options.up == "auto" else options.up
-        up = _direction(axis)
-        with observer.stage("placing cameras") as step:
-            placed = place_cameras(
-                gaussians,
-                up=up,
-                count=options.max_views,
-                width=options.width,
-                height=options.width * 3 // 4,
-                kind=None if options.kind == "auto" else options.kind,
-                backend=backend,
-                progress=step,
-            )
-        scene = _with_cameras(gaussians, up, placed, provenance)
-        observer.info(_placed(placed))
-        if options.up == "auto":
-            observer.info(
-                f"up is {axis}, as is usual in such files; where the views lie on their side, "
-                "say which axis is, such as --up +z"
-            )
-    return ImportedScene(scene=save_scene(scene, folder), alignment=alignment, placed=placed)
-
-
-def _provenance(file: Path, backend: str) -> dict[str, Any]:
-    return {
+    provenance: dict[str, Any] = {
         "command": "import",
         "file": file.name,
         "format": splat_format(file),
         "backend": backend,
         "versions": versions("splatseg", "torch"),
     }
+    if options.data is None:
+        scene, placed = _with_cameras(
+            file, gaussians, options, provenance=provenance, backend=backend, observer=observer
+        )
+        return ImportedScene(scene=save_scene(scene, folder), alignment=None, placed=placed)
+    capture = read_capture(options.data, format=options.format, strict=options.strict)
+    for note in capture.notes:
+        observer.note(note)
+    alignment = None
+    if not options.as_is:
+        alignment = align(gaussians, capture, splats=file, backend=backend)
+        observer.info(_aligned(alignment))
+        if alignment.moved:
+            gaussians = gaussians.transformed(alignment.capture_from_file)
+    provenance |= _alignment_facts(alignment, capture)
+    scene = scene_of_capture(capture, gaussians, provenance=provenance)
+    return ImportedScene(scene=save_scene(scene, folder), alignment=alignment, placed=None)
+
+
+def _with_cameras(
+    file: Path,
+    gaussians: Gaussians,
+    options: ImportOptions,
+    *,
+    provenance: Mapping[str, Any],
+    backend: BackendName,
+    observer: Observer,
+) -> tuple[Scene, VirtualViews]:
+    """The scene with virtual cameras."""
+    # Nothing in a file says which axis is up in it.
+    usual = "+y" if splat_format(file) == "gltf" else "-y"
+    axis = usual if options.up == "auto" else options.up
+    sign = 1.0 if axis[0] == "+" else -1.0
+    x, y, z = (sign if letter == axis[1] else 0.0 for letter in "xyz")
+    with observer.stage("placing cameras") as step:
+        placed = place_cameras(
+            gaussians,
+            up=(x, y, z),
+            count=options.max_views,
+            width=options.width,
+            height=options.width * 3 // 4,
+            kind=None if options.kind == "auto" else options.kind,
+            backend=backend,
+            progress=step,
+        )
+    where = "around an object" if placed.kind == "object" else "within a room"
+    observer.info(
+        f"{len(placed.views)} virtual cameras {where}; they show "
+        f"{100 * placed.coverage:.0f} % of what is visible"
+    )
+    if options.up == "auto":
+        observer.info(
+            f"up is {axis}, as is usual in such files; where the views lie on their side, "
+            "say which axis is, such as --up +z"
+        )
+    facts = {"kind": placed.kind, "coverage": round(placed.coverage, 4), "up": [x, y, z]}
+    scene = Scene(
+        gaussians=gaussians,
+        views=placed.views,
+        up=(x, y, z),
+        provenance={**provenance, "virtual_views": facts},
+    )
+    return scene, placed
 
 
 def read_with_notes(
@@ -174,40 +203,6 @@ def read_with_notes(
     return gaussians
 
 
-def _with_photographs(
-    gaussians: Gaussians,
-    capture: Capture,
-    found: Alignment | None,
-    provenance: dict[str, Any],
-) -> Scene:
-    if found is not None and found.moved:
-        gaussians = gaussians.transformed(found.capture_from_file)
-    facts = provenance | _alignment_facts(found, capture)
-    return scene_of_capture(capture, gaussians, provenance=facts)
-
-
-def _with_cameras(
-    gaussians: Gaussians,
-    up: tuple[float, float, float],
-    placed: VirtualViews,
-    provenance: dict[str, Any],
-) -> Scene:
-    facts = {"kind": placed.kind, "coverage": round(placed.coverage, 4), "up": list(up)}
-    provenance = provenance | {"virtual_views": facts}
-    return Scene(gaussians=gaussians, views=placed.views, up=up, provenance=provenance)
-
-
-def _up_axis(file: Path) -> str:
-    """The axis that is up in files of this format; nothing in them says so."""
-    return "+y" if splat_format(file) == "gltf" else "-y"
-
-
-def _direction(axis: str) -> tuple[float, float, float]:
-    sign = 1.0 if axis[0] == "+" else -1.0
-    x, y, z = (sign if letter == axis[1] else 0.0 for letter in "xyz")
-    return x, y, z
-
-
 def _aligned(found: Alignment) -> str:
     quality = f"correlation {found.correlation:.2f}, {found.psnr:.1f} dB at a small size"
     if not found.moved:
@@ -215,14 +210,6 @@ def _aligned(found: Alignment) -> str:
     return (
         f"the splats were in another frame (correlation {found.correlation_as_is:.2f}) and were "
         f"moved: {found.what} ({quality})"
-    )
-
-
-def _placed(placed: VirtualViews) -> str:
-    where = "around an object" if placed.kind == "object" else "within a room"
-    return (
-        f"{len(placed.views)} virtual cameras {where}; they show "
-        f"{100 * placed.coverage:.0f} % of what is visible"
     )
 
 

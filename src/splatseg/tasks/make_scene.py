@@ -10,8 +10,6 @@ from splatseg.core import Capture, View
 from splatseg.core.boundary import boundary
 from splatseg.core.checkpoints import Checkpoints
 from splatseg.core.interrupts import deferred_interrupts
-from splatseg.core.options import Count
-from splatseg.core.options import options as options_class
 from splatseg.errors import InputError
 from splatseg.evaluate import PhotographReport, evaluate_photographs, render_and_photograph
 from splatseg.evaluate.photographs import MaskUse
@@ -37,15 +35,19 @@ from splatseg.report.camera_map import camera_map
 from splatseg.report.fit_report import FitReportData, fit_record, fit_report, verdict_of
 from splatseg.report.fit_verdict import FitVerdict
 from splatseg.report.images import Gallery, GalleryImage, colour_difference
-from splatseg.tasks.checkpoints import CheckpointOptions, check_fit_output, fit_folder
+from splatseg.tasks.checkpoints import check_fit_output, fit_folder
 from splatseg.tasks.moving import (
     LeftOut,
-    MovingClock,
     capture_without_moving,
     moving_things,
     without_moving_points,
 )
-from splatseg.tasks.photographs import Poses, capture_of, with_depth_evidence, with_scans
+from splatseg.tasks.photographs import (
+    MakeSceneOptions,
+    capture_of,
+    with_depth_evidence,
+    with_scans,
+)
 from splatseg.tasks.work import (
     REPORTS_FOLDER,
     SILENT,
@@ -54,61 +56,6 @@ from splatseg.tasks.work import (
     versions,
     write_page,
 )
-
-
-@options_class(removed={"preset": "`FitOptions.preset` gives the options of a preset"})
-class MakeSceneOptions(CheckpointOptions):
-    """How photographs are read, where cameras come from, and how a stopped fit goes on."""
-
-    format: str = "auto"
-    """Layout of the capture: auto, or one of `io.captures.FORMATS`."""
-
-    strict: bool = False
-    """Refuse a capture that lists a photograph which would be left out; see `read_capture`."""
-
-    poses: Poses = "auto"
-    """Source of the cameras. given: the capture. sfm: structure from motion on the photographs,
-    kept in SCENE/capture. pointmaps: pointmaps of pairs of photographs by a network such as DUSt3R, with
-    a dense cloud to start from; for few photographs. auto: sfm where the capture has no poses."""
-
-    pointmaps: str | None = None
-    """With `poses` pointmaps: a folder of recorded pointmaps, or a model of another package,
-    MODEL[=WEIGHTS][,OPTION=VALUE...]. None takes the folder pointmaps beside the photographs."""
-
-    frames: Count = 120
-    """Number of frames taken from a video."""
-
-    keep_checkpoint: bool = False
-    """Keep the checkpoint of the finished fit, so that `resume` with more minutes or steps can make
-    it longer."""
-
-    depth_evidence: str | None = None
-    """Evidence of depth, as see --what depth writes it, instead of the capture's depth maps: a
-    folder, or its name in the capture or in a scene that is replaced."""
-
-    scans: Path | None = None
-    """Laser scans in the world of the capture: the fit starts at their points and learns their
-    depth as metric depth. For streets, whose far and thin objects photographs place badly."""
-
-    points: Path | None = None
-    """PLY file of points, or of a mesh, in the world of the capture: the fit starts there instead
-    of at the capture's points."""
-
-    moving: Path | None = None
-    """Boxes of moving objects, which are left out of training views and scans: a JSON file, a drive
-    of KITTI-360 or a segment of Waymo."""
-
-    moving_classes: tuple[str, ...] = ()
-    """Classes of label maps that move, such as car pedestrian: they are left out of training
-    views."""
-
-    moving_evidence: str | None = None
-    """Label maps of `moving_classes`: a folder, or its name in the capture or in a scene that is
-    replaced. None takes the only label maps there are."""
-
-    moving_clock: MovingClock = "recorded"
-    """Times of the boxes. recorded: those of the data set, such as seconds. frames: the last number
-    in the name of a view or scan."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -252,14 +199,10 @@ def _capture(
     else:
         capture, poses = capture_of(
             data,
+            options,
             scene=folder,
-            format=options.format,
-            strict=options.strict,
-            poses=options.poses,
-            pointmaps=options.pointmaps,
             # A fixed fit keeps every point; other strategies thin the cloud themselves.
             max_points=fit_options.max_gaussians if fit_options.strategy == "fixed" else None,
-            frames=options.frames,
             seed=fit_options.seed,
             observer=observer,
         )

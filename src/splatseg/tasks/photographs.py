@@ -16,6 +16,8 @@ from splatseg.core import (
 )
 from splatseg.core.boundary import boundary
 from splatseg.core.models import PointmapModel
+from splatseg.core.options import Count
+from splatseg.core.options import options as options_class
 from splatseg.errors import InputError, MissingFileError
 from splatseg.fit import (
     DepthPoints,
@@ -57,8 +59,69 @@ from splatseg.pose.pointmaps import (
     PointmapResult,
     recover_from_pointmaps,
 )
+from splatseg.tasks.checkpoints import CheckpointOptions
+from splatseg.tasks.moving import MovingClock
 from splatseg.tasks.see import model_of, name_of
 from splatseg.tasks.work import Observer, check_parent
+
+Poses = Literal["auto", "given", "sfm", "pointmaps"]
+"""Where cameras come from."""
+
+
+@options_class(removed={"preset": "`FitOptions.preset` gives the options of a preset"})
+class MakeSceneOptions(CheckpointOptions):
+    """How photographs are read, where cameras come from, and how a stopped fit goes on."""
+
+    format: str = "auto"
+    """Layout of the capture: auto, or one of `io.captures.FORMATS`."""
+
+    strict: bool = False
+    """Refuse a capture that lists a photograph which would be left out; see `read_capture`."""
+
+    poses: Poses = "auto"
+    """Source of the cameras. given: the capture. sfm: structure from motion on the photographs,
+    kept in SCENE/capture. pointmaps: pointmaps of pairs of photographs by a network such as
+    DUSt3R, with a dense cloud to start from; for few photographs. auto: sfm where the capture has
+    no poses."""
+
+    pointmaps: str | None = None
+    """With `poses` pointmaps: a folder of recorded pointmaps, or a model of another package,
+    MODEL[=WEIGHTS][,OPTION=VALUE...]. None takes the folder pointmaps beside the photographs."""
+
+    frames: Count = 120
+    """Number of frames taken from a video."""
+
+    keep_checkpoint: bool = False
+    """Keep the checkpoint of the finished fit, so that `resume` with more minutes or steps can make
+    it longer."""
+
+    depth_evidence: str | None = None
+    """Evidence of depth, as see --what depth writes it, instead of the capture's depth maps: a
+    folder, or its name in the capture or in a scene that is replaced."""
+
+    scans: Path | None = None
+    """Laser scans in the world of the capture: the fit starts at their points and learns their
+    depth as metric depth. For streets, whose far and thin objects photographs place badly."""
+
+    points: Path | None = None
+    """PLY file of points, or of a mesh, in the world of the capture: the fit starts there instead
+    of at the capture's points."""
+
+    moving: Path | None = None
+    """Boxes of moving objects, which are left out of training views and scans: a JSON file, a drive
+    of KITTI-360 or a segment of Waymo."""
+
+    moving_classes: tuple[str, ...] = ()
+    """Classes of label maps that move, such as car pedestrian: they are left out of training
+    views."""
+
+    moving_evidence: str | None = None
+    """Label maps of `moving_classes`: a folder, or its name in the capture or in a scene that is
+    replaced. None takes the only label maps there are."""
+
+    moving_clock: MovingClock = "recorded"
+    """Times of the boxes. recorded: those of the data set, such as seconds. frames: the last number
+    in the name of a view or scan."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -104,23 +167,16 @@ def examine_capture(
     return Examination(diagnosis=diagnosis, written=fix)
 
 
-Poses = Literal["auto", "given", "sfm", "pointmaps"]
-"""Where cameras come from."""
-
 # So many photographs without a pose are named; poses.json names all.
 _NAMED = 10
 
 
 def capture_of(
     data: Path,
+    options: MakeSceneOptions,
     *,
     scene: Path,
-    format: str,
-    strict: bool,
-    poses: Poses,
-    pointmaps: str | None,
     max_points: int | None,
-    frames: int,
     seed: int,
     observer: Observer,
 ) -> tuple[Capture, PoseReport | PointmapReport | None]:
@@ -128,32 +184,29 @@ def capture_of(
 
     Args:
         data: What the user gave.
+        options: How it is read, and where cameras come from.
         scene: The scene folder; poses that are found are kept in it, and read from there by a
             later run with the same photographs.
-        format: How a capture is read; see `read_capture`.
-        strict: Whether a capture may list photographs that are not there; see `read_capture`.
-        poses: Where cameras come from.
-        pointmaps: Whose pointmaps, with `poses` pointmaps; see `capture_of_pointmaps`.
         max_points: Most points of a cloud from pointmaps; None leaves it to them.
-        frames: Frames taken from a video.
         seed: Of everything that is drawn at random.
         observer: Is told of the progress and of what was found.
 
     Returns:
         The capture, and how its poses were found; None where they came with it.
     """
+    format, poses, pointmaps = options.format, options.poses, options.pointmaps
     if pointmaps is not None and poses != "pointmaps":
         raise InputError(f"pointmaps: expected none with `poses` {poses}, got {pointmaps!r}.")
     if not _without_poses(data, format, poses):
-        return read_capture(data, format=format, strict=strict), None
+        return read_capture(data, format=format, strict=options.strict), None
     if poses == "pointmaps":
         return capture_of_pointmaps(
             data, pointmaps, scene=scene, max_points=max_points, seed=seed, observer=observer
         )
     check_utf8(data)
-    options = PoseOptions(seed=seed, frames=frames)
+    how = PoseOptions(seed=seed, frames=options.frames)
     with observer.pose_stage() as step:
-        result = recover_poses(data, folder=scene / POSES_FOLDER, options=options, progress=step)
+        result = recover_poses(data, folder=scene / POSES_FOLDER, options=how, progress=step)
     for line in _sentences(data, scene / POSES_FOLDER, result):
         observer.info(line)
     return result.capture, result.report

@@ -1,10 +1,11 @@
 """Views of a scene, or a path through it, as PNG files and films."""
 
 import math
+import re
 import shutil
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,12 @@ from torch import Tensor
 
 from splatseg.core import (
     UNLABELLED,
+    Capture,
     ClassTable,
+    LabelledMesh,
+    LabelledPoints,
     Layer,
+    LayerInfo,
     Renderable,
     RenderableLayer,
     RenderableView,
@@ -29,6 +34,7 @@ from splatseg.core.boundary import boundary
 from splatseg.core.options import Count
 from splatseg.core.options import options as options_class
 from splatseg.errors import InputError
+from splatseg.evaluate import PointSurfaceOptions, SurfaceField
 from splatseg.evaluate.held_out import label_map_in
 from splatseg.io.atomic import atomic_folder, sweep
 from splatseg.io.cameras import cameras_content
@@ -36,13 +42,14 @@ from splatseg.io.images import save_png
 from splatseg.io.json_files import read_json, write_json
 from splatseg.io.npy import read_npy
 from splatseg.io.paths import path_inside
+from splatseg.io.surfaces import read_surface
 from splatseg.io.video import check_encoder, write_video
 from splatseg.lift import GaussianField
 from splatseg.render import BackendName
 from splatseg.report.images import colour_depth
 from splatseg.report.layer_colours import layer_colours
 from splatseg.report.legend import colour_labels, legend_of
-from splatseg.tasks.work import SILENT, Observer, Work, check_parent_writable
+from splatseg.tasks.work import SILENT, Observer, Work, check_parent_writable, scene_of_capture
 
 # Depths beyond these shares of all are shown in the end colours.
 _NEAR, _FAR = 0.01, 0.99
@@ -421,3 +428,61 @@ def _save(image: Tensor, folder: Path, view: View) -> None:
 def _file(folder: Path, view: View, suffix: str) -> Path:
     """Where a view's file goes; names with a slash go into subfolders."""
     return path_inside(folder, f"{view.name}{suffix}")
+
+
+_NO_CLASSES = re.compile(r"instance|object|part|segment|track", re.IGNORECASE)
+"""Names of labels that are no classes, so that the class table does not name them."""
+
+
+@boundary
+def render_truth(
+    surface: LabelledMesh | LabelledPoints | Path,
+    source: Scene | Capture,
+    output: Path,
+    *,
+    options: RenderingOptions | None = None,
+    points: PointSurfaceOptions | None = None,
+    zero_is_class: bool = False,
+    void: int | None = None,
+    observer: Observer = SILENT,
+) -> Rendering:
+    """Draw what views see of a labelled surface, as `render_views` draws Gaussians.
+
+    OUTPUT/<labels>/<view>.png has the ids, 16 bit, 0 where nothing is met or the label is void, in
+    the photograph's own pixels: what `evaluate_scene` takes as truth.
+
+    Args:
+        surface: A mesh or points in the world of the views, or a file of them, see
+            `splatseg.io.surfaces.read_surface`.
+        source: Whose views are drawn; of a scene the Gaussians are not looked at.
+        output: Folder to write to.
+        options: Which views, and which labels of the surface (`what`), perhaps depth and alpha;
+            nothing in `what` is all labels, and None those of the test views.
+        points: How points become a surface.
+        zero_is_class: Of a file: the id 0 is a class and not void, ids grow by 1.
+        void: Of a file: a further id that means void.
+        observer: Is told of the progress.
+
+    Raises:
+        InputError: If the surface has no such labels, there is no such split, or something else
+            lies in the way.
+        MissingPackageError: If embreex is not installed.
+    """
+    source_ids = isinstance(surface, Path) and zero_is_class
+    if isinstance(surface, Path):
+        surface = read_surface(surface, zero_is_class=zero_is_class, void=void)
+    infos = {name: _info(name, ids, source_ids=source_ids) for name, ids in surface.labels.items()}
+    field = SurfaceField(surface, points=points, infos=infos)
+    options = options or RenderingOptions(what=())
+    if not options.what:
+        options = replace(options, what=tuple(surface.labels))
+    scene = source if isinstance(source, Scene) else scene_of_capture(source)
+    return render_views(scene, output, options=options, field=field, observer=observer)
+
+
+def _info(name: str, ids: Tensor, *, source_ids: bool) -> LayerInfo:
+    present = [int(id) for id in ids.unique().tolist() if id >= 0]
+    return LayerInfo(
+        names={id: f"{name} {id}" for id in present} if _NO_CLASSES.search(name) else {},
+        source_ids={id: id - 1 for id in present} if source_ids else None,
+    )

@@ -8,11 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
-from splatseg.core import Scan, ScanSource, Scene, View
-from splatseg.core.boundary import boundary
+from splatseg.core import Scan, ScanSource, View
 from splatseg.core.json_values import plain_object
 from splatseg.errors import InputError, brief
 from splatseg.io.class_tables import class_rows
@@ -29,7 +27,6 @@ from splatseg.io.scene_fields import (
     scene_field_path,
 )
 from splatseg.io.scene_folder import work_on_scene
-from splatseg.render import BackendName
 from splatseg.street.blocks import (
     Drive,
     DriveBlock,
@@ -60,7 +57,7 @@ from splatseg.tasks.street_inputs import (
     check_labelled,
     drive_inputs,
 )
-from splatseg.tasks.work import SILENT, Observer, Work, layer_versions
+from splatseg.tasks.work import Observer, Work, layer_versions
 
 
 class DigestedScans:
@@ -102,28 +99,16 @@ class BlockParts:
 
     Args:
         drive: How it was cut.
-        inputs: What is learned from.
-        views: All that are learned from, as training views.
         builder: Builds fields.
-        options: Where depth comes from.
-        observer: Is told which block is made.
+        views: All that are learned from, as training views.
 
     Raises:
         InputError: If a block has no view or no label map, or a scan is broken.
     """
 
-    def __init__(
-        self,
-        drive: Drive,
-        inputs: DriveInputs,
-        *,
-        views: tuple[View, ...],
-        builder: FieldBuilder,
-        options: StreetOptions,
-        observer: Observer,
-    ) -> None:
+    def __init__(self, drive: Drive, builder: FieldBuilder, views: tuple[View, ...]) -> None:
         self._drive, self._builder = drive, builder
-        self._options, self._observer = options, observer
+        inputs = builder.inputs
         self._views = [block_views(views, drive, block) for block in drive.blocks]
         for block, own in zip(drive.blocks, self._views, strict=True):
             check_labelled(own, inputs.evidence, f" of block {block.index + 1} of {len(drive)}")
@@ -150,28 +135,21 @@ class BlockParts:
         return len(load_mesh_field(block_file(folder, block.index)).mesh)
 
     def _made(self, block: DriveBlock) -> MeshField:
-        drive, views = self._drive, self._views[block.index]
-        self._observer.info(f"block {block.index + 1} of {len(drive)}: {len(views)} views")
+        drive, views, points = self._drive, self._views[block.index], self.points
+        said = f"block {block.index + 1} of {len(drive)}: {len(views)} views"
+        self._builder.work.observer.info(said)
+        scans = None if self._scans is None else self._scans.of(block)
+        if scans is not None and not scans.scan_names and self._builder.options.depth == "auto":
+            scans = None  # no laser was on here: depth comes from what else is there
         built = self._builder.build(
             views,
-            scans=self._scans_of(block),
-            points=self._near(block),
+            scans=scans,
+            points=None if points is None else points[drive.near(block, points)],
             near=partial(drive.near, block),
             details={"block": block.index, "blocks": len(drive)},
         )
         self.primitives[block.index] = len(built.field.mesh)
         return built.field
-
-    def _scans_of(self, block: DriveBlock) -> ScanSource | None:
-        """Scans of a block; where no laser was on, depth comes from what else is there."""
-        own = None if self._scans is None else self._scans.of(block)
-        unseen = own is not None and not own.scan_names and self._options.depth == "auto"
-        return None if unseen else own
-
-    def _near(self, block: DriveBlock) -> Float[Tensor, "n 3"] | None:
-        if self.points is None:
-            return None
-        return self.points[self._drive.near(block, self.points)]
 
 
 def check_field_name(root: Path, name: str, *, in_blocks: bool) -> None:
@@ -252,15 +230,8 @@ class StreetDrive:
         }
 
 
-@boundary
 def street_drive(
-    scene: Scene,
-    *,
-    options: StreetOptions,
-    field_options: DnmpOptions | None = None,
-    overwrite: bool = False,
-    backend: BackendName = "auto",
-    observer: Observer = SILENT,
+    work: Work, options: StreetOptions, field_options: DnmpOptions | None, *, overwrite: bool
 ) -> StreetDrive:
     """Make the mesh field of a drive block by block, in the folder of its scene.
 
@@ -269,51 +240,36 @@ def street_drive(
     stopped, to the last bit.
 
     Args:
-        scene: The scene; the field is written into its folder.
+        work: The scene; the field is written into its folder.
         options: What the field is made from, and how long blocks are.
         field_options: How; None is the default, or the published setting where `options` ask
             for it.
         overwrite: Replace a field of this name, once the first block is made, and begin again
             what was stopped.
-        backend: Rendering backend of Gaussians, for their depth.
-        observer: Is told of the progress.
 
     Raises:
         InputError: If there is a field of this name, what was stopped was made from something
             else, or evidence, photographs, points or depth cannot be used.
         KeyboardInterrupt: With a sentence on how to go on, if it was interrupted.
     """
-    cut = options.blocks
+    cut, root = options.blocks, work.root
     if cut is None:
         raise InputError("block_length: expected the length of blocks, got none.")
-    if scene.root is None:
-        raise InputError("scene: expected one with a folder to write blocks to, got none.")
-    path_inside(scene.root, FOLDER, options.field, DRIVE_FILE, make=False)
+    path_inside(root, FOLDER, options.field, DRIVE_FILE, make=False)
     if not overwrite:
-        check_field_name(scene.root, options.field, in_blocks=True)
-    work = Work(scene=scene, backend=backend, observer=observer)
+        check_field_name(root, options.field, in_blocks=True)
     with (
-        work_on_scene(scene.root, "street", writes=[FOLDER]),
+        work_on_scene(root, "street", writes=[FOLDER]),
         drive_inputs(work, options) as inputs,
     ):
         learned = tuple(replace(view, split="train") for view in inputs.views)
         centres = frame_centres(learned, metres_per_unit=inputs.metres)
         drive = cut_drive(centres, options=cut, metres_per_unit=inputs.metres)
         builder = FieldBuilder(work, inputs, options, field_options)
-        parts = BlockParts(
-            drive, inputs, views=learned, builder=builder, options=options, observer=observer
-        )
-        about = drive_identity(
-            work,
-            inputs,
-            options=options,
-            field_options=builder.chosen,
-            layer=builder.layer,
-            scans=parts.digested,
-            points=parts.points,
-        )
-        folder = _begun(scene.root, drive, parts, options.field, about, overwrite=overwrite)
-        _build(drive, folder, parts, about, observer)
+        parts = BlockParts(drive, builder, learned)
+        about = drive_identity(builder, scans=parts.digested, points=parts.points)
+        folder = _begun(root, drive, parts, options.field, about, overwrite=overwrite)
+        _build(drive, folder, parts, about, work.observer)
     field = open_blocks(folder)
     return StreetDrive(
         field=field,
@@ -378,42 +334,29 @@ def _build(
         ) from error
 
 
-# What blocks of a drive depend on, as digests: blocks of the same are gone on with, no others.
-
-
 _NAMES_AND_PATHS = ("field", "scans", "moving")
 """Options that are no part of a field: data may move."""
 
 
 def drive_identity(
-    work: Work,
-    inputs: DriveInputs,
-    *,
-    options: StreetOptions,
-    field_options: DnmpOptions,
-    layer: str,
-    scans: DigestedScans | None,
-    points: Tensor | None,
+    builder: FieldBuilder, *, scans: DigestedScans | None, points: Tensor | None
 ) -> dict[str, Any]:
     """All that the fields of a drive's blocks depend on, in values that JSON holds.
 
     Args:
-        work: The scene.
-        inputs: What is learned from.
-        options: What the fields are made from.
-        field_options: How.
-        layer: Name of their layer.
+        builder: Of the fields.
         scans: All of them read already.
         points: Of the capture.
     """
+    work, inputs, options = builder.work, builder.inputs, builder.options
     views = inputs.views
     classes = inputs.evidence.classes or work.scene.classes
     gaussians = work.gaussians
     boxes = () if inputs.moving is None else inputs.moving.things.boxes
     asked = {k: v for k, v in asdict(options).items() if k not in _NAMES_AND_PATHS}
     return {
-        "options": asked | {"layer": layer, "evidence": inputs.name},
-        "field_options": asdict(field_options),
+        "options": asked | {"layer": builder.layer, "evidence": inputs.name},
+        "field_options": asdict(builder.chosen),
         "versions": layer_versions(),
         "inputs": {
             "metres_per_unit": inputs.metres,

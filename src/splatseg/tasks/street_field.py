@@ -28,7 +28,6 @@ from splatseg.street.geometry import DepthView, PrimitiveCaster, distances_of
 from splatseg.street.mesh import PrimitiveMesh
 from splatseg.street.options import PUBLISHED, DnmpOptions
 from splatseg.tasks.moving import LeftOut
-from splatseg.tasks.render_truth import scene_of_views
 from splatseg.tasks.street_inputs import (
     DriveInputs,
     StreetOptions,
@@ -42,6 +41,7 @@ from splatseg.tasks.work import (
     Work,
     check_new_folder,
     layer_versions,
+    scene_of_capture,
     spread_views,
     view_spec,
 )
@@ -81,16 +81,13 @@ class KeptDepths:
     def __iter__(self) -> Iterator[DepthView]:
         """All of them, as they are."""
         for depth in self._depths:
-            view = next((one for one in self._wanted if _same_pose(one, depth)), None)
+            pose = depth.camera.cam_from_world  # in any size
+            same = (v for v in self._wanted if torch.equal(v.camera.cam_from_world, pose))
+            view = next(same, None)
             if view is not None:
                 sample = _sample(view, depth)
                 self.samples += [sample] if len(sample.distances) else []
             yield depth
-
-
-def _same_pose(view: View, depth: DepthView) -> bool:
-    """Whether depth is of a view, in any size."""
-    return torch.equal(view.camera.cam_from_world, depth.camera.cam_from_world)
 
 
 def _sample(view: View, depth: DepthView) -> DepthSample:
@@ -180,7 +177,7 @@ class FieldBuilder:
         options: StreetOptions,
         field_options: DnmpOptions | None,
     ) -> None:
-        self._work, self._inputs, self._options = work, inputs, options
+        self.work, self.inputs, self.options = work, inputs, options
         self.chosen = chosen_options(options, field_options)
         self.layer = options.layer or inputs.name
         self.timings: dict[str, float] = {}
@@ -207,12 +204,12 @@ class FieldBuilder:
             InputError: If there are no points or no depth, or they cannot be used.
         """
         began = time.monotonic()
-        inputs, observer = self._inputs, self._work.observer
+        inputs, observer = self.inputs, self.work.observer
         observer.info("points and depth are gathered")
         sources = drive_sources(
-            self._work,
+            self.work,
             views,
-            depth=self._options.depth,
+            depth=self.options.depth,
             scans=scans,
             points=points,
             cell=min(self.chosen.voxels) / inputs.metres / _CELLS,
@@ -229,9 +226,9 @@ class FieldBuilder:
                 inputs.evidence,
                 options=self.chosen,
                 layer=self.layer,
-                classes=inputs.evidence.classes or self._work.scene.classes,
+                classes=inputs.evidence.classes or self.work.scene.classes,
                 metres_per_unit=inputs.metres,
-                seed=self._options.seed,
+                seed=self.options.seed,
                 progress=stages.told,
             )
         left_out = {} if inputs.moving is None else {"moving": inputs.moving.record}
@@ -239,7 +236,7 @@ class FieldBuilder:
         info = replace(
             made.field.info,
             evidence=inputs.name,
-            views_asked=view_spec(self._options.views),
+            views_asked=view_spec(self.options.views),
             versions=layer_versions(),
             details={**made.field.info.details, **more},
         )
@@ -383,7 +380,7 @@ def open_drive(path: Path, *, new_scene: Path | None = None, data: Path | None =
             )
         return there
     check_new_folder(new_scene)
-    save_scene(replace(scene_of_views(capture), provenance={"command": "street"}), new_scene)
+    save_scene(scene_of_capture(capture, provenance={"command": "street"}), new_scene)
     # As later calls see it: matrices of a file are those of the capture but for the last bits.
     return load_scene(new_scene)
 

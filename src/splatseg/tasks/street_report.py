@@ -1,6 +1,5 @@
 """The page of a drive: its mesh field, and the points of laser scans that were labelled."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,6 @@ from torch import Tensor
 
 from splatseg.core import (
     UNLABELLED,
-    Camera,
     ClassTable,
     Renderable,
     RenderableLayer,
@@ -44,7 +42,7 @@ from splatseg.report.street_report import (
 )
 from splatseg.report.words import count_text
 from splatseg.street.field import VERTEX_WORDS
-from splatseg.street.geometry import DepthView, capture_views, enclosing, field_views
+from splatseg.street.geometry import capture_views, enclosing, field_views
 from splatseg.street.shapes import load_shapes
 from splatseg.tasks.scan_labels import LabelBy, ScanLabels
 from splatseg.tasks.street_drive import StreetDrive
@@ -310,7 +308,8 @@ def in_sight(
         views = tuple(view for view in scene.views if view.name in set(learned)) or views
     mapped = all(v.depth is not None and depth_kind(v.depth) != "relative" for v in views)
     depths = capture_views(views) if mapped else field_views(field, [v.camera for v in views])
-    seen = points_in_sight(points, _pairs(depths), metres_per_unit=scene.metres_per_unit or 1.0)
+    pairs = ((view.camera, view.depth) for view in depths)
+    seen = points_in_sight(points, pairs, metres_per_unit=scene.metres_per_unit or 1.0)
     return seen, "the capture's depth maps" if mapped else "the depth that the field shows"
 
 
@@ -332,8 +331,3 @@ def true_ids(
         {id: own[name] for id, name in found.items() if name is not None},
         default=UNLABELLED,
     )
-
-
-def _pairs(depths: Iterator[DepthView]) -> Iterator[tuple[Camera, Tensor]]:
-    for view in depths:
-        yield view.camera, view.depth

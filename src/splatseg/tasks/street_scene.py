@@ -180,18 +180,12 @@ def make_street_field(
         FileFormatError: If a file is damaged.
     """
     options = options or StreetOptions()
-    root = scene.root
-    if root is None:
+    if scene.root is None:
         raise InputError("scene: expected one with a folder to write a field to, got none.")
+    root = scene.root
     if options.block_length is not None:
-        return street_drive(
-            scene,
-            options=options,
-            field_options=field_options,
-            overwrite=overwrite,
-            backend=backend,
-            observer=observer,
-        )
+        work = Work(scene=scene, backend=backend, observer=observer)
+        return street_drive(work, options, field_options, overwrite=overwrite)
     if not overwrite:
         check_field_name(root, options.field, in_blocks=False)
     with work_on_scene(root, "street", writes=[FOLDER]):

@@ -363,8 +363,23 @@ def find_label_maps(folders: Sequence[Path], name: str | None, *, option: str = 
     return found[labels[0]]
 
 
-def scene_of_capture(capture: Capture, gaussians: Gaussians, **more: Any) -> Scene:
-    """A scene of Gaussians with what a capture knows of its world; `more` are further fields."""
+def scene_of_capture(capture: Capture, gaussians: Gaussians | None = None, **more: Any) -> Scene:
+    """A scene with what a capture knows of its world; `more` are further fields.
+
+    Args:
+        capture: The capture.
+        gaussians: Its Gaussians; None is none, a scene of views alone.
+        more: Further fields of the scene.
+    """
+    if gaussians is None:
+        nothing = torch.zeros(0, 3)
+        gaussians = Gaussians(
+            means=nothing,
+            rotations=torch.zeros(0, 4),
+            scales=nothing,
+            opacities=torch.zeros(0),
+            sh=torch.zeros(0, 1, 3),
+        )
     known = Scene(
         gaussians=gaussians,
         views=capture.views,

@@ -27,7 +27,8 @@ from splatseg.io.scene_folder import CHECKPOINT_FILE, is_scene
 from splatseg.render import BackendName
 from splatseg.tasks.benchmark.options import BenchOptions
 from splatseg.tasks.benchmark.walks import walk_splits
-from splatseg.tasks.make_scene import MakeSceneOptions, fit_capture
+from splatseg.tasks.make_scene import fit_capture
+from splatseg.tasks.photographs import MakeSceneOptions
 from splatseg.tasks.work import Observer
 
 SCENES_FOLDER = "scenes"
