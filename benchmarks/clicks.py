@@ -54,7 +54,7 @@ from splatseg.lift.mass.segment_masses import view_masses
 from splatseg.prompting.feature_source import FeatureMembership, FeatureMembershipOptions
 from splatseg.prompting.prompts import ViewPrompt
 from splatseg.tasks import SelectOptions, open_selector
-from splatseg.tasks.select_options import SelectPostProcessing, SelectThreshold
+from splatseg.tasks.sources import SelectPostProcessing, SelectThreshold
 
 MOST_CLICKS = 10
 ROBOT_VIEWS = 10
@@ -78,7 +78,6 @@ class Bench:
             granularity="part" if args.level == "part" else "object",
             threshold=args.rule,
             post_processing=args.after,
-            **_steps(args),
         )
         self.session = open_selector(self.scene, options=self.options, source=self._source())
         self.seconds: list[float] = []
@@ -168,7 +167,7 @@ class Bench:
         prompts = [_point(target.view, target.point)]
         for _ in range(clicks - 1):
             try:
-                found = self.session.select(prompts)
+                found = self.session.select(prompts, advise=True)
             except InputError:
                 break
             hint = found.next_click
@@ -206,10 +205,6 @@ def _fields(options: SelectOptions) -> dict[str, Any]:
     return {name: getattr(options, name) for name in SelectOptions.__dataclass_fields__}
 
 
-def _steps(args: argparse.Namespace) -> dict[str, bool]:
-    return dict.fromkeys(args.without, False)
-
-
 def _point(view: View, point: Sequence[float], *, positive: bool = True) -> ViewPrompt:
     return ViewPrompt(
         view=view, points=torch.tensor([list(point)]), positive=torch.tensor([positive])
@@ -226,9 +221,7 @@ def rows_of(bench: Bench) -> dict[str, Callable[[ClickTarget], Selection]]:
     return {
         "click": bench.click,
         "auto": lambda target: bench.click(target, granularity="auto"),
-        "raw": lambda target: bench.click(
-            target, filter=False, grow=False, refine=False, fill_holes=False, hidden=False
-        ),
+        "raw": lambda target: bench.click(target, post_processing="none"),
         "noisy": bench.noisy,
         **{f"noisy{draw}": partial(bench.noisy, draw=draw) for draw in range(1, NOISY_CLICKS)},
         "scribble": bench.scribble,
@@ -308,7 +301,6 @@ def main() -> None:
     parser.add_argument("--after", choices=get_args(SelectPostProcessing), default="auto")
     parser.add_argument("--evidence", default="masks_sam")
     parser.add_argument("--rows", nargs="+", default=["click", "auto", "noisy", "mask"])
-    parser.add_argument("--without", nargs="*", default=[], help="steps that are left out")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--limit", type=int, help="so many objects, evenly through all")
     parser.add_argument("--level", choices=("instance", "part"), default="instance")

@@ -51,8 +51,7 @@ from splatseg.lift import (
 )
 from splatseg.lift.heads import ClassifierHead
 from splatseg.methods import find_method
-from splatseg.tasks.segment import segment
-from splatseg.tasks.segment_options import SegmentOptions
+from splatseg.tasks.segment import SegmentOptions, segment
 
 _NEW = Path(tempfile.gettempdir()) / "splatseg-joint"
 """Named, and never written."""

@@ -34,13 +34,14 @@ from splatseg.edit import load_document
 from splatseg.io.layers import save_layer
 from splatseg.io.scene import save_scene
 from splatseg.lift import label_map, uplift
+from splatseg.lift.completion.complete import complete
 from splatseg.lift.pipeline import lift_labels
 from splatseg.methods.associate import associate
 from splatseg.render import render
 from splatseg.tasks.edit import edit_scene
-from splatseg.tasks.edit_options import EditOptions
+from splatseg.tasks.edit_operations import EditOptions
 from splatseg.tasks.export import export_scene
-from splatseg.tasks.export_options import ExportOptions
+from splatseg.tasks.export_labels import ExportOptions
 
 BASE = {"masks": 60, "views": 12, "gaussians": 20_000, "ids": 50}
 """What does not double is so."""
@@ -129,7 +130,7 @@ def operation(name: str, doubles: str, made: Inputs, folder: Path) -> Callable[[
     if name == "uplift":
         return lambda: uplift(made.gaussians, made.views, made)
     if name == "segment":
-        return lambda: lift_labels(made.gaussians, made.views, made)
+        return lambda: complete(made.gaussians, lift_labels(made.gaussians, made.views, made))
     if name == "render":
         return lambda: [render(made.gaussians, view.camera) for view in made.views]
     if name == "export":

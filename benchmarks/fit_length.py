@@ -8,7 +8,7 @@ CAPTURE has true maps in `semantic` and `instance`, and machine labels in `label
 all held-out views and of those that `segment` looks at, mIoU of classes from `labels_semantic`
 (`uplift`), of instances from true maps (`uplift`: what the geometry allows) and, with `--masks`,
 from masks (`associate`). All on held-out views. `--generate` writes a room to begin with. The
-thresholds of `splatseg.tasks.fit_quality` come from here (decision 0025).
+thresholds of `splatseg.tasks.segment_inputs` come from here (decision 0025).
 """
 
 import argparse
@@ -24,7 +24,7 @@ from splatseg.io.evidence import open_evidence
 from splatseg.lift import GaussianField
 from splatseg.synthetic import cameras, room, write_capture
 from splatseg.tasks import SegmentOptions, segment
-from splatseg.tasks.fit_quality import fit_quality
+from splatseg.tasks.segment_inputs import fit_quality
 
 _STEPS = (7, 15, 30, 60, 120, 250, 500, 1000, 2000, 4000)
 

@@ -42,9 +42,8 @@ from splatseg.lift import (
     uplift,
 )
 from splatseg.methods import find_method
-from splatseg.tasks.scene_parts import scene_field
-from splatseg.tasks.segment import segment
-from splatseg.tasks.segment_options import SegmentOptions
+from splatseg.tasks.segment import SegmentOptions, segment
+from splatseg.tasks.work import scene_field
 
 STATIC = 8
 """Classes of camvid from 1 on that stand still; those after them move."""

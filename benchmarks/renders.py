@@ -58,7 +58,6 @@ def main() -> int:
     parser.add_argument("--model", default="classical")
     parser.add_argument("--up", default=None, help="as of `splatseg import`; the scene's own")
     parser.add_argument("--width", type=int, default=ImportOptions().width, help="of renders")
-    parser.add_argument("--height", type=int, default=ImportOptions().height)
     parser.add_argument("--work", type=Path, default=None, help="folder to keep, emptied by nobody")
     asked = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
@@ -70,7 +69,7 @@ def main() -> int:
         up = asked.up or _axis(fitted)
         ways = {
             "photographs": ImportOptions(data=asked.data, as_is=True),
-            "renders": ImportOptions(up=up, width=asked.width, height=asked.height),
+            "renders": ImportOptions(up=up, width=asked.width),
         }
         rows: dict[str, Row] = {}
         for title, options in ways.items():

@@ -109,7 +109,7 @@ class Asker:
         """By clicks where the selection asks for them."""
         prompts = [_click(view, _middle(self.truth(view)))]
         for _ in range(count - 1):
-            hint = self._session.select(prompts).next_click
+            hint = self._session.select(prompts, advise=True).next_click
             if hint is None:
                 break
             x, y = (float(v) for v in hint.point)

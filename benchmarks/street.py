@@ -67,8 +67,7 @@ from splatseg.neighbours import NeighbourIndex
 from splatseg.street.field import MeshField
 from splatseg.street.files import load_mesh_field
 from splatseg.tasks.scan_labels import viewed_points
-from splatseg.tasks.segment import segment
-from splatseg.tasks.segment_options import SegmentOptions
+from splatseg.tasks.segment import SegmentOptions, segment
 
 LAYER = "street"
 BIG = 1000

@@ -28,6 +28,8 @@ import numpy as np
 import torch
 from PIL import Image
 from scored import _SCORE
+from splatseg.street.mesh import PrimitiveMesh
+from splatseg.street.options import DnmpOptions
 from torch import nn
 
 from splatseg.core import Scene, View
@@ -36,25 +38,31 @@ from splatseg.io.captures import read_capture
 from splatseg.io.evidence import open_evidence
 from splatseg.io.scans import read_scans
 from splatseg.io.scene import load_scene
-from splatseg.street.build import DnmpOptions, seen_shares
+from splatseg.street.build import seen_shares
 from splatseg.street.field import MeshField
 from splatseg.street.files import save_mesh_field
 from splatseg.street.geometry import fit_geometry
 from splatseg.street.hits import MeshCaster
-from splatseg.street.primitives import PrimitiveMesh, voxel_primitives
-from splatseg.street.radiance import PUBLISHED_RADIANCE, RadianceModel, RadianceOptions
-from splatseg.street.radiance_rendering import render_view
-from splatseg.street.radiance_training import RadianceFit, RadianceRecord, train_radiance
+from splatseg.street.primitives import voxel_primitives
+from splatseg.street.radiance import (
+    PUBLISHED_RADIANCE,
+    RadianceFit,
+    RadianceModel,
+    RadianceOptions,
+    RadianceRecord,
+    render_view,
+    train_radiance,
+)
 from splatseg.street.shape_files import load_shapes
-from splatseg.tasks.render_truth import scene_of_views
-from splatseg.tasks.street._sources import capture_points, drive_sources
+from splatseg.tasks.street_inputs import capture_points, drive_sources
+from splatseg.tasks.work import Work, scene_of_capture
 
 
 def fitted_mesh(scene: Scene, views: tuple[View, ...], depth: str, steps: int) -> PrimitiveMesh:
     shapes = load_shapes()
     sources = drive_sources(
-        scene, views, depth=depth, scans=read_scans(scene.source), cell=0.1, backend="cpu",
-        points=capture_points(scene.source),
+        Work(scene=scene, backend="cpu"), views, depth=depth, scans=read_scans(scene.source),
+        cell=0.1, points=capture_points(scene.source),
     )  # fmt: skip
     primitives = voxel_primitives(sources.points, shapes=shapes)
     print(f"{sources.said}; primitives by level {torch.bincount(primitives.levels).tolist()}")
@@ -141,7 +149,7 @@ def main() -> None:
                 sizes=tuple(kept["sizes"].tolist()),
             )
     else:
-        scene = scene_of_views(capture) if args.scene is None else load_scene(args.scene)
+        scene = scene_of_capture(capture) if args.scene is None else load_scene(args.scene)
         scene = replace(scene, source=args.data.resolve())
         mesh = fitted_mesh(scene, capture.train_views, args.depth, args.geometry)
         if args.mesh is not None:

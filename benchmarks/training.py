@@ -53,8 +53,7 @@ from splatseg.methods import find_method
 from splatseg.methods.identity import IdentityOptions, TrainingContext, train_identity
 from splatseg.methods.logits import LogitOptions, train_logits
 from splatseg.methods.probabilities import train_probabilities
-from splatseg.tasks.segment import segment
-from splatseg.tasks.segment_options import SegmentOptions
+from splatseg.tasks.segment import SegmentOptions, segment
 
 SCORER = Path(__file__).resolve().parents[1] / ".." / "shared" / "score" / "score.py"
 CHANNELS = 16

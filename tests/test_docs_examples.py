@@ -22,7 +22,7 @@ PROJECT_ROOT = Path(__file__).resolve().parent.parent
 NEEDS_A_PACKAGE = {"splatseg.render.cuda": "gsplat"}
 """Modules that import an optional package at the top; they are looked at where it is installed."""
 
-NOT_EXAMPLES = {"splatseg.__main__", "splatseg.cli.__main__", "splatseg._native"}
+NOT_EXAMPLES = {"splatseg.__main__", "splatseg._native"}
 
 
 def modules() -> list[str]:

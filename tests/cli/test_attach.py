@@ -155,7 +155,7 @@ def test_a_ply_with_columns(labelled, kept, edited, splatseg, tmp_path) -> None:
 
 def test_an_imported_scene(labelled, kept, edited, splatseg, tmp_path) -> None:
     scene = tmp_path / "imported"
-    command = ("import", edited, "-o", scene, "--max-views", 2, "--width", 64, "--height", 48)
+    command = ("import", edited, "-o", scene, "--max-views", 2, "--width", 64)
     assert splatseg(*command)[0] == 0
     status, _out, err = splatseg("attach", labelled.scene, scene, "--layers", "fifths")
     assert (status, err) == (0, "")

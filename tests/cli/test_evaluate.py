@@ -16,7 +16,7 @@ from splatseg.core import (
     Selection,
 )
 from splatseg.io.scene import load_scene, load_scene_layer, save_scene_layer
-from splatseg.lift import PointLabelOptions, labels_of_points
+from splatseg.lift import labels_of_points
 
 CPU = ("--backend", "cpu")
 CLASSES = [
@@ -86,22 +86,17 @@ def test_instances_agree_with_the_scorer(labelled, both) -> None:
     assert ours["learned_from"] == 1
 
 
-@pytest.mark.parametrize("ranked", [False, True])
-def test_panoptic_agrees_with_the_scorer(labelled, both, tmp_path, ranked) -> None:
+def test_panoptic_agrees_with_the_scorer(labelled, both) -> None:
     capture, metadata = labelled.capture, labelled.capture / "metadata.json"
-    scores: tuple = ()
-    if ranked:
-        (tmp_path / "scores.json").write_text(json.dumps({"4": 0.1, "5": 0.5, "600": 0.9}))
-        scores = ("--scores", tmp_path / "scores.json")
     ours, theirs = both(
         (
             "--layer", "classes", "--truth", capture / "semantic", "--metric", "panoptic",
-            "--instances", "objects", "--truth-instances", capture / "instance", *scores,
+            "--instances", "objects", "--truth-instances", capture / "instance",
         ),
         (
             "panoptic", "--pred-instance", both.out / "objects",
             "--pred-semantic", both.out / "classes", "--truth-instance", capture / "instance",
-            "--truth-semantic", capture / "semantic", "--metadata", metadata, *scores,
+            "--truth-semantic", capture / "semantic", "--metadata", metadata,
         ),
     )  # fmt: skip
     assert 0.1 < theirs["PQ_things"] < 0.95, "the case must test something"
@@ -163,12 +158,10 @@ def test_points_agree_with_the_scorer(labelled, both, rng, tmp_path) -> None:
     ours, _ = both(
         (
             "--layer", "objects", "--points", tmp_path / "points.npz", "--metric", "instances",
-            "--points-rule", "nearest",
         ),
         ("points", "--pred", tmp_path / "pred.npz", "--truth", tmp_path / "points.npz"),
     )  # fmt: skip
     assert ours["points_truth_instances"] == 2
-    assert ours["points_rule"] == "nearest"
 
 
 def test_tables_and_a_file(labelled, splatseg, tmp_path) -> None:
@@ -211,7 +204,6 @@ def refusals(labelled, tmp_path):
     np.savez(tmp_path / "flat.npz", xyz=np.zeros((3, 2)), semantic=np.ones(3, np.int64))
     np.savez(tmp_path / "floats.npz", xyz=np.zeros((3, 3)), semantic=np.ones(3))
     np.savez(tmp_path / "bare.npz", xyz=np.zeros((3, 3)))
-    (tmp_path / "bad.json").write_text('{"4": "high"}')
     (tmp_path / "part").mkdir()
     return [
         (("--truth", semantic), "--layer"),
@@ -219,13 +211,11 @@ def refusals(labelled, tmp_path):
         (panoptic, "--truth-instances"),
         ((*panoptic, "--truth-instances", instance), "tells the class of each instance"),
         ((*layer, "--truth", semantic, "--instances", "objects"), "expected metric panoptic"),
-        (
-            (*whole, "--scores", tmp_path / "bad.json"),
-            "bad.json: score of instance 4: expected a finite number",
-        ),
+        ((*whole, "--scores", "s.json"), "--scores: this option was removed; AP50 ranks all"),
+        ((*whole, "--photographs"), "--photographs: this option was removed; renders are"),
         ((*whole, "--instances", "nothing"), "nothing"),
-        ((*whole, "--metadata", tmp_path / "no.json"), "no.json"),
-        ((*whole, "--metadata", tmp_path / "bad.json"), "bad.json: classes: expected a list"),
+        ((*whole, "--classes", tmp_path / "no.json"), "no.json"),
+        ((*whole, "--metadata", "m.json"), "--metadata: this option was removed; --classes takes"),
         ((*whole, "--truth-instances", tmp_path / "part"), "part: expected evidence"),
         ((*layer, "--points", tmp_path / "no.npz"), "no.npz"),
         ((*layer, "--points", tmp_path / "flat.npz"), "flat.npz: expected xyz of n x 3"),
@@ -252,29 +242,6 @@ def test_true_instances_of_every_view_are_needed(labelled, splatseg) -> None:
     status, _, err = splatseg("evaluate", labelled.scene, *words, *CPU)
     assert status == 2
     assert "the first is test_2" in err
-
-
-def test_points_take_labels_by_the_rule_asked_for(labelled, splatseg, rng, tmp_path) -> None:
-    gaussians = load_scene(labelled.scene).gaussians
-    xyz = gaussians.means[rng.integers(0, len(gaussians), 900)].numpy()
-    xyz = (xyz + rng.normal(0, 0.3, xyz.shape)).astype(np.float32)
-    truth = np.where(xyz[:, 0] < 0.1, 2, 7)
-    np.savez(tmp_path / "points.npz", xyz=xyz, semantic=truth)
-    ids = load_scene_layer(labelled.scene, "classes").ids
-    right = {}
-    for rule in ("weighted", "nearest"):
-        status, text, err = splatseg(
-            "evaluate", labelled.scene, "--layer", "classes",
-            "--points", tmp_path / "points.npz", "--points-rule", rule, "--json",
-        )  # fmt: skip
-        assert status == 0, err
-        options = PointLabelOptions(rule=rule)
-        found = labels_of_points(gaussians, ids, torch.from_numpy(xyz), options=options)
-        right[rule] = float((found.ids.numpy() == truth).mean())
-        figures = json.loads(text)
-        assert figures["points_accuracy"] == pytest.approx(right[rule])
-        assert figures["points_rule"] == rule
-    assert right["weighted"] != right["nearest"], "the case must tell the rules apart"
 
 
 def evaluated(labelled, splatseg, *words) -> tuple[dict, str]:

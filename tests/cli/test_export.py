@@ -237,7 +237,7 @@ def test_mistakes_get_one_sentence(labelled, splatseg, tmp_path) -> None:
         (("--what", "coco", "--layer", "walls", "--split", "none", *out), "test, train"),
         (("--what", "statue", *out), "objects"),
         (("--layer", "walls", "--only", "door", "-o", tmp_path / "a.ply"), "left wall"),
-        (("--layer", "walls", "--min-confidence", 2, "-o", tmp_path / "a.ply"), "0 to 1"),
+        (("--layer", "walls", "--min-confidence", 2, "-o", tmp_path / "a.ply"), "in [0, 1]"),
         (("--instances", "chosen", "-o", tmp_path / "a.ply"), "labels"),
         (("--layer", "walls", "-o", scene / "gaussians.ply"), "the scene's own"),
         (("--layer", "walls", "-o", scene / "scene.ply"), "scene.json"),

@@ -5,17 +5,18 @@ import importlib.util
 import re
 import subprocess
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import pytest
 import tyro
 
 from splatseg.cli import COMMANDS
-from splatseg.cli._pages import FOLDER, kept_page, wrapped
 from splatseg.cli._parse import flowing, parse
-from splatseg.cli._words import listed, option_value, with_flags
+from splatseg.cli._words import FOLDER, kept_page, listed, option_value, with_flags, wrapped
+from splatseg.core.options import options
 from splatseg.errors import InputError
 
 ROOT = Path(__file__).parents[2]
@@ -125,6 +126,39 @@ def test_words() -> None:
     assert with_flags("layer, truth: no.", {"layer", "truth"}) == "--layer, --truth: no."
     assert with_flags("layer, other: no.", {"layer"}) == "layer, other: no."
     assert with_flags("no colon", {"no"}) == "no colon"
+
+
+@options(removed={"slack": "`size` bounds it"})
+class Fitted:
+    """Options of which one went."""
+
+    size: int = 1
+    """Size."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fitting:
+    """A command of which a flag went, too."""
+
+    REMOVED: ClassVar[Mapping[str, str]] = {"old": "use --new"}
+
+    plain: tyro.conf.OmitArgPrefixes[Fitted] = field(default_factory=Fitted)
+    nested: Fitted = field(default_factory=Fitted)
+
+
+@pytest.mark.parametrize(
+    ("word", "said"),
+    [
+        ("--slack", "--slack: this option was removed; --size bounds it."),
+        ("--slack=3", "--slack: this option was removed; --size bounds it."),
+        ("--no-slack", "--no-slack: this option was removed; --size bounds it."),
+        ("--nested.slack", "--nested.slack: this option was removed; --size bounds it."),
+        ("--old", "--old: this option was removed; use --new."),
+    ],
+)
+def test_flags_that_went_say_what_to_use(word, said) -> None:
+    with pytest.raises(InputError, match=f"^{re.escape(said)}$"):
+        parse(Fitting, [word, "3"], prog="p", config=())
 
 
 def test_long_lines_are_wrapped_and_commands_stay_whole() -> None:

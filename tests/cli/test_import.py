@@ -9,7 +9,7 @@ from splatseg.core import Labels, Similarity
 from splatseg.io.scene import load_scene, save_scene_layer
 from splatseg.io.splats import read_splats, write_splats
 
-SMALL = ("--max-views", 13, "--width", 64, "--height", 48)
+SMALL = ("--max-views", 13, "--width", 64)
 
 
 @pytest.fixture

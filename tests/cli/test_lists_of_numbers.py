@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import pytest
 
-from splatseg.cli._pages import default_config
 from splatseg.cli._parse import parse
+from splatseg.cli._words import default_config
 from splatseg.errors import InputError
 
 STREET = ("street", "CAPTURE")

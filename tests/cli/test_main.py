@@ -16,7 +16,7 @@ from collections.abc import Callable
 import pytest
 
 from splatseg import cli
-from splatseg.cli import _types
+from splatseg.cli import _shared as _types
 from splatseg.errors import BackendError, InputError, MissingPackageError, RangeError
 
 
@@ -255,7 +255,7 @@ def test_debug_adds_the_traceback(
     assert text.endswith("error: DATA is empty.\n")
 
 
-@pytest.mark.parametrize("module", ["splatseg", "splatseg.cli"])
+@pytest.mark.parametrize("module", ["splatseg"])
 def test_python_dash_m(module: str) -> None:
     done = subprocess.run(
         [sys.executable, "-m", module, "nothing"], capture_output=True, text=True, check=False

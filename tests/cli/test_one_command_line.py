@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from splatseg import cli
-from splatseg.cli import COMMANDS, _types
-from splatseg.cli._pages import FOLDER
+from splatseg.cli import COMMANDS
+from splatseg.cli._words import FOLDER
 from splatseg.io.scene import load_scene_layer
 
 CLI = Path(cli.__file__).parent
@@ -21,33 +21,7 @@ MAKE = {
     "see", "segment", "select", "sharpen", "street",
 }  # fmt: skip
 TELL = {"doctor", "info"}
-SHARED = {
-    "backend": "Backend",
-    "format": "Format",
-    "frames": "Frames",
-    "json": "Json",
-    "overwrite": "Overwrite",
-    "quiet": "Quiet",
-    "scene": "SceneFolder",
-    "seed": "Seed",
-}
-OWN = {("fit", "frames")}  # of a video
 OWN_HELP = {"frames": ["fit"], "data CAPTURE": ["import"], "seed": ["attach", "demo"]}
-
-
-def annotations(name: str) -> dict[str, str]:
-    """The fields that a command's own class declares."""
-    source = Path(importlib.import_module(COMMANDS[name].module).__file__ or "").read_text()
-    (found,) = (
-        node
-        for node in ast.parse(source).body
-        if isinstance(node, ast.ClassDef) and node.name == "Command"
-    )
-    return {
-        field.target.id: ast.unparse(field.annotation)
-        for field in found.body
-        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name)
-    }
 
 
 def help_of(page: str, flag: str) -> str | None:
@@ -102,9 +76,10 @@ def test_each_command_shows_three_examples_that_parse(name, monkeypatch) -> None
     examples = [line for line in page.splitlines() if line.startswith("splatseg ")]
     assert "For example:" in page
     assert len(examples) >= 3
-    module: Any = importlib.import_module(COMMANDS[name].module)
+    entry = COMMANDS[name]
+    module: Any = importlib.import_module(entry.module)
     ran = []
-    monkeypatch.setattr(module, "run", ran.append)
+    monkeypatch.setattr(module, f"run_{entry.part}" if entry.part else "run", ran.append)
     for line in examples:
         words = shlex.split(line.partition(" > ")[0])[1:]
         assert words[0] == name
@@ -150,7 +125,7 @@ def run_calls(tree: ast.AST, modules: set[str]) -> list[str]:
         ("from splatseg.cli import main", ["main"]),
         ("import subprocess", ["subprocess"]),
         ("fit.run(x)", ["fit.run"]),
-        ("from splatseg.cli._types import Json", []),
+        ("from splatseg.cli._shared import Json", []),
         ("job.run()", []),
     ],
 )
@@ -205,9 +180,10 @@ def test_json_of_the_main_job(small, splatseg, tmp_path) -> None:
     assert edited["operations"][0]["kind"] == "remove"
     assert edited["gaussians"] == len(layer) - edited["operations"][0]["selected"]
     imported = one_object(
-        splatseg("import", out, "-o", tmp_path / "i", "--max-views", 2, "--width", 32, "--height",
-                 32, *cpu, "--json")
-    )  # fmt: skip
+        splatseg(
+            "import", out, "-o", tmp_path / "i", "--max-views", 2, "--width", 32, *cpu, "--json"
+        )
+    )
     assert imported["train_views"] + imported["test_views"] == 2
     attached = one_object(splatseg("attach", scene, tmp_path / "i", "--json"))
     assert (attached["names"], attached["found"]) == (["classes"], len(layer))

@@ -5,8 +5,8 @@ import sys
 
 import pytest
 
-from splatseg.cli import _progress
-from splatseg.cli._progress import ProgressLines, progress
+from splatseg.cli import _shared as _progress
+from splatseg.cli._shared import ProgressLines, progress
 
 
 class Clock:
@@ -95,7 +95,7 @@ def test_in_a_terminal_a_bar_is_drawn(capsys, monkeypatch) -> None:
 
 
 _PROGRAM = """
-from splatseg.cli import _progress
+from splatseg.cli import _shared as _progress
 _progress.SECONDS_BETWEEN_LINES = 0.0
 from splatseg.cli import main
 import sys

@@ -16,7 +16,7 @@ from splatseg.io.scene import load_scene, load_scene_layer, save_scene
 from splatseg.io.splats import write_splats
 from splatseg.tasks import SeeOptions, see
 
-SIZE = ("--max-views", 13, "--width", 64, "--height", 48)
+SIZE = ("--max-views", 13, "--width", 64)
 CLASSICAL = ("--model", "classical", "--evidence", "masks")
 
 
@@ -214,7 +214,7 @@ def test_backend(imported, splatseg, monkeypatch, backend) -> None:
             asked.add(options["backend"])
             raise KeyboardInterrupt
 
-    monkeypatch.setattr("splatseg.tasks._view_images.GaussianField", Field)
+    monkeypatch.setattr("splatseg.tasks.see.GaussianField", Field)
     splatseg("see", imported, *CLASSICAL, "--backend", backend)
     assert asked == {backend}
 

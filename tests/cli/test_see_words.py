@@ -9,8 +9,7 @@ from splatseg.io.evidence import load_text_embeddings, open_evidence
 from splatseg.io.scene import load_scene, load_scene_layer
 from splatseg.models import LoadOptions, find_family
 from splatseg.tasks import SeeOptions, see
-from splatseg.tasks.segment import segment
-from splatseg.tasks.segment_options import SegmentOptions
+from splatseg.tasks.segment import SegmentOptions, segment
 from support.checkpoints import saved
 
 TRAIN = ("train_0", "train_1", "train_3")

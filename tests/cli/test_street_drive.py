@@ -90,7 +90,7 @@ def test_whatever_reads_a_field_reads_blocks(made, generated_drive, splatseg, tm
 
 def test_ctrl_c_says_how_to_go_on(made, generated_drive, splatseg, tmp_path, monkeypatch) -> None:
     """Labels are asked for as well: what was stopped is finished before they are given."""
-    from splatseg.tasks.street import _blocks
+    from splatseg.tasks import street_drive as _blocks
 
     root = shutil.copytree(made, tmp_path / "scene")
     words = ("street", root, "--scans", generated_drive, *FAST, *BLOCKS, "--field", "b", "--quiet")

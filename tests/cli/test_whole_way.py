@@ -139,7 +139,7 @@ def test_objects_leave_in_files_and_come_back(room, run, classes, tmp_path) -> N
     run("export", room, "--what", "objects", "--layer", classes, "-o", tmp_path / "objects")
     (file,) = (tmp_path / "objects").rglob("*floor*.ply")
     assert len(read_splats(file)) == int(floor.sum())
-    run("import", file, "-o", tmp_path / "floor", "--max-views", 13, "--width", 64, "--height", 48)
+    run("import", file, "-o", tmp_path / "floor", "--max-views", 13, "--width", 64)
     assert len(load_scene(tmp_path / "floor").gaussians) == int(floor.sum())
 
     kept = torch.randperm(len(layer), generator=torch.Generator().manual_seed(3))[: len(layer) // 2]

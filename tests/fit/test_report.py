@@ -14,7 +14,7 @@ from splatseg.fit import FitOptions, FitResult, fit
 from splatseg.io.scene import save_scene
 from splatseg.lift import GaussianField
 from splatseg.pose import PoseReport
-from splatseg.tasks._fit_report import score_and_report
+from splatseg.tasks.make_scene import score_and_report
 
 OPTIONS = FitOptions(minutes=None, steps=120, max_gaussians=70, seed=3, background="black")
 

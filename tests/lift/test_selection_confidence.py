@@ -10,8 +10,7 @@ from splatseg.io.layers import save_layer
 from splatseg.lift import GaussianField, attach, label_map
 from splatseg.lift.field_layers import selection_labels
 from splatseg.tasks import describe
-from splatseg.tasks._export_job import _sure_selection
-from splatseg.tasks.label_columns import label_tables
+from splatseg.tasks.export_labels import _sure_selection, label_tables
 
 
 def wall(opacities: list[float]) -> tuple[Gaussians, Camera]:

@@ -14,8 +14,7 @@ from splatseg.methods.cosseg import CossegOptions
 from splatseg.methods.cosseg.checkpoint import save_point_encoder
 from splatseg.methods.cosseg.network import RandlaEncoder
 from splatseg.methods.cosseg.pyramid import PointInputs, RandlaConfig
-from splatseg.tasks.segment import segment
-from splatseg.tasks.segment_options import SegmentOptions
+from splatseg.tasks.segment import SegmentOptions, segment
 from support.checkpoints import saved
 
 LABELS = SegmentOptions(evidence="labels_semantic")

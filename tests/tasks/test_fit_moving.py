@@ -21,8 +21,7 @@ from splatseg.io.moving import write_moving
 from splatseg.io.scene import load_scene
 from splatseg.io.scene_folder import is_scene, is_unfinished
 from splatseg.tasks import MakeSceneOptions, fit_capture
-from splatseg.tasks._fit_moving import capture_without_moving
-from splatseg.tasks._moving import MovingThings
+from splatseg.tasks.moving import MovingThings, capture_without_moving
 from support.observers import Stopping
 
 FEW = FitOptions(minutes=None, steps=3, max_gaussians=300, prune_floaters=False)
@@ -207,9 +206,10 @@ def test_the_command_hands_its_flags_on(monkeypatch, tmp_path) -> None:
 
     monkeypatch.setattr(fit, "fit_capture", record)
     command = Command(
-        data=tmp_path, output=tmp_path, moving=Path("b.json"), moving_classes=("car",),
-        moving_evidence="maps", moving_clock="frames",
-    )  # fmt: skip
+        data=tmp_path,
+        output=tmp_path,
+        capture=fit._Scene(moving=Path("b.json"), moving_classes=("car",)),
+    )
     with pytest.raises(Stop):
         run(command)
     asked = given[0]

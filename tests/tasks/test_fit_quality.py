@@ -8,7 +8,7 @@ import torch
 from splatseg.io.images import save_png
 from splatseg.report.fit_report import MIN_PSNR
 from splatseg.tasks import SegmentOptions, segment
-from splatseg.tasks.fit_quality import fit_quality
+from splatseg.tasks.segment_inputs import fit_quality
 from support.observers import Stopping
 
 ASKED = SegmentOptions(evidence="labels_semantic")

@@ -146,7 +146,7 @@ def test_editing_leaves_nothing(made, tmp_path) -> None:
 
 
 def test_importing_leaves_nothing(made, tmp_path) -> None:
-    options = ImportOptions(max_views=3, width=48, height=32)
+    options = ImportOptions(max_views=3, width=48)
     file = made / "gaussians.ply"
     with pytest.raises(Cancelled):
         import_scene(

@@ -6,7 +6,7 @@ import torch
 from splatseg.core import LabelMap
 from splatseg.errors import InputError
 from splatseg.io.evidence import create_evidence, save_label_map
-from splatseg.tasks._label_evidence import find_label_maps
+from splatseg.tasks.work import find_label_maps
 
 
 def labels(folder) -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from splatseg.tasks._moving import moving_things
+from splatseg.tasks.moving import moving_things
 from support.kitti import DRIVE, stored_box, write, write_boxes, write_drive
 
 

@@ -19,8 +19,8 @@ from splatseg.io.scene import load_scene
 from splatseg.models import LoadOptions
 from splatseg.models.networks.segmenters import SegmenterOptions, SemanticOptions
 from splatseg.tasks import MakeSceneOptions, SeeOptions, SegmentOptions, fit_capture, see, segment
-from splatseg.tasks._depth_evidence import with_depth_evidence
-from splatseg.tasks._observer import SILENT
+from splatseg.tasks.photographs import with_depth_evidence
+from splatseg.tasks.work import SILENT
 from support.checkpoints import saved
 from support.checkpoints_labels import save_tokenizer
 from support.observers import Stopping

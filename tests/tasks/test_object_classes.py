@@ -12,8 +12,7 @@ from splatseg.errors import InputError
 from splatseg.io.scene import load_scene, load_scene_layer
 from splatseg.methods.object_classes import ObjectLabelOptions
 from splatseg.tasks import report_layer, save_segmentation
-from splatseg.tasks.segment import segment
-from splatseg.tasks.segment_options import SegmentOptions
+from splatseg.tasks.segment import SegmentOptions, segment
 
 LABELS = SegmentOptions(evidence="labels_semantic")
 TRACKS = SegmentOptions(evidence="labels_tracked")

@@ -27,7 +27,7 @@ from splatseg.io.evidence import (
 from splatseg.io.scene import load_scene, load_scene_layer, save_scene_layer
 from splatseg.lift.vocabulary import Vocabulary, vocabulary_of
 from splatseg.tasks import Found, QueryOptions, QuerySession, draw_answers, draw_heat, query
-from splatseg.tasks.query_report import write_query_report
+from splatseg.tasks.pictures import write_query_report
 
 
 @pytest.fixture(scope="module")
@@ -308,7 +308,7 @@ def test_pictures_from_python(scene, layers, words, tmp_path) -> None:
             "expected features, 'masks_sam' has masks",
         ),
         (["A", "--masks", "nothing", "--features", "features_text"], "nothing"),
-        (["A", "--model", "classical"], "expected one that encodes words"),
+        (["A", "--model", "classical"], "expected a model that encodes words"),
     ],
 )
 def test_what_is_wrong_is_one_sentence(folder, words, call, said, capsys) -> None:

@@ -13,7 +13,7 @@ from splatseg.core import Camera, Capture, ClassInfo, ClassTable, LabelledMesh, 
 from splatseg.errors import InputError
 from splatseg.evaluate import PointSurfaceOptions
 from splatseg.tasks import EvaluationOptions, RenderingOptions, evaluate_scene, render_truth
-from splatseg.tasks.render_truth import scene_of_views
+from splatseg.tasks.work import scene_of_capture
 from support.ply import write_ply
 
 WIDTH, HEIGHT = 24, 18
@@ -84,7 +84,7 @@ def test_maps_are_written_as_render_writes_them(capture, mesh, tmp_path) -> None
 def test_ids_from_zero_grow_by_one_and_say_so(capture, mesh, tmp_path) -> None:
     options = RenderingOptions(what=("instance", "depth"), split="all")
     done = render_truth(
-        mesh, scene_of_views(capture), tmp_path / "out", options=options, zero_is_class=True
+        mesh, scene_of_capture(capture), tmp_path / "out", options=options, zero_is_class=True
     )
     assert done.views == 3
     assert set(np.unique(ids(tmp_path / "out" / "instance" / "v1.png"))) == {0, 1, 2}
@@ -103,7 +103,7 @@ def test_what_was_drawn_is_a_truth_to_evaluate_with(capture, mesh, tmp_path) -> 
 
     render_truth(mesh, capture, tmp_path / "out", options=RenderingOptions(what=("label",)))
     scores = evaluate_scene(
-        scene_of_views(capture),
+        scene_of_capture(capture),
         options=EvaluationOptions(layer="label", truth=tmp_path / "out" / "label"),
         field=SurfaceField(read_surface(mesh)),
     )

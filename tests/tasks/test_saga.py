@@ -15,7 +15,8 @@ from splatseg.io.scene import load_scene
 from splatseg.lift.affinity import AffinityHead
 from splatseg.methods import find_method
 from splatseg.methods.saga import SagaOptions
-from splatseg.tasks._segment_inputs import with_companions
+from splatseg.tasks.segment_inputs import with_companions
+from splatseg.tasks.work import Work
 
 
 @pytest.fixture
@@ -82,19 +83,20 @@ def test_what_is_at_hand_is_taken_by_name_or_asked_for(scene) -> None:
     method = find_method("saga")
     options = SagaOptions.published(steps=3)
     room = load_scene(scene)
-    found = with_companions(room, method, options, observer)
+    work = Work(scene=room, observer=observer)
+    found = with_companions(work, method, options)
     assert found.guidance == "features_dino"
     shutil.copytree(room.source / "features_dino", scene / "evidence" / "features_sam2")
-    assert with_companions(room, method, options, observer).guidance == "features_sam2"
+    assert with_companions(work, method, options).guidance == "features_sam2"
     assert [line.split(",")[0] for line in told] == [
         "guidance: features_dino",
         "guidance: features_sam2",
     ]
     named = replace(options, guidance="features_dino")
-    assert with_companions(room, method, named, observer) is named
+    assert with_companions(work, method, named) is named
     bare = replace(room, root=None, source=None)
     with pytest.raises(InputError, match=r"guidance: .*splatseg see SCENE.*--guidance None\."):
-        with_companions(bare, method, options, observer)
+        with_companions(Work(scene=bare), method, options)
 
 
 class Told:

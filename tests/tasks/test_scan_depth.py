@@ -17,7 +17,7 @@ from splatseg.io.captures import read_capture
 from splatseg.io.depths import load_depth
 from splatseg.io.scene import load_scene
 from splatseg.tasks import MakeSceneOptions, fit_capture
-from splatseg.tasks._scan_depth import EVIDENCE, with_scans
+from splatseg.tasks.photographs import EVIDENCE, with_scans
 
 FEW = FitOptions(minutes=None, steps=3, max_gaussians=500, prune_floaters=False)
 
@@ -130,7 +130,8 @@ def test_a_fit_starts_at_scans_and_records_them(small_room, walls, tmp_path) -> 
 
 
 def test_the_flag_turns_depth_on() -> None:
-    command = Command(data=Path("d"), output=Path("o"), scans=Path("d"))
+    plain = Command(data=Path("d"), output=Path("o"))
+    command = replace(plain, capture=replace(plain.capture, scans=Path("d")))
     assert _options(command).depth == "metric"
-    assert _options(replace(command, scans=None)).depth == "off"
+    assert _options(plain).depth == "off"
     assert _options(replace(command, depth="relative")).depth == "relative"

@@ -3,7 +3,7 @@
 import csv
 import io
 
-from splatseg.tasks.score_tables import write_class_table, write_confusion
+from splatseg.tasks.figures import write_class_table, write_confusion
 
 FIGURES = {
     "names_per_class": {"3": "salt & 50 % | a_b\\c\n~", "9": "plain"},

@@ -1,12 +1,15 @@
 """Selecting in a scene: sources, modes, places, steps, and what is refused."""
 
+import importlib
 from dataclasses import dataclass
+from functools import partial
 
 import pytest
 import torch
 
 from splatseg.core import Features, InstanceFacts, Labels, LayerInfo, Scene, Selection, View
 from splatseg.errors import InputError, ShapeError
+from splatseg.methods.prompt.options import PromptOptions
 from splatseg.prompting import pipeline
 from splatseg.prompting.prompts import AxisBox, Ball, Lasso, Similar, ViewPrompt
 from splatseg.tasks import SelectOptions, open_selector, select, select_session
@@ -168,7 +171,7 @@ def test_more_like_this(world) -> None:
 
 
 @pytest.mark.parametrize("step", ["filter", "grow", "refine", "fill_holes", "hidden"])
-def test_each_step_has_its_switch(world, step, monkeypatch) -> None:
+def test_each_step_follows_unless_none_is_to(world, step, monkeypatch) -> None:
     seen = []
 
     def record(confidence, context):
@@ -179,20 +182,18 @@ def test_each_step_has_its_switch(world, step, monkeypatch) -> None:
     made = world.select(world.click(IN_1))
     assert seen == ["layer"]
     assert step in made.seconds
-    world.select(world.click(IN_1), options=SelectOptions(**{step: False}))
+    world.select(world.click(IN_1), options=SelectOptions(post_processing="none"))
     assert seen == ["layer"]
 
 
-def test_the_seed_and_max_pixels_reach_the_prompts(world) -> None:
+def test_the_seed_reaches_the_prompts(world, monkeypatch) -> None:
+    few = partial(PromptOptions, max_pixels=40)
+    monkeypatch.setattr(importlib.import_module("splatseg.tasks.select"), "PromptOptions", few)
     mask = torch.zeros(30, 40, dtype=torch.bool)
     mask[11:29, 2:18] = True
     prompt = ViewPrompt(view=world.scene.views[0], mask=mask)
     pixels = []
-    for options in (
-        SelectOptions(max_pixels=40),
-        SelectOptions(max_pixels=40),
-        SelectOptions(max_pixels=40, seed=1),
-    ):
+    for options in (SelectOptions(), SelectOptions(), SelectOptions(seed=1)):
         source = Everything(len(world.ids))
         world.select(prompt, source=source, options=options)
         pixels.append(source.asked[0][0][0].pixels)
@@ -221,7 +222,7 @@ def test_a_session_opens_its_source_once_and_keeps_nothing_else(world) -> None:
 def test_who_advises_is_asked_with_the_final_confidence(world, monkeypatch) -> None:
     heard = []
     monkeypatch.setattr(select_session, "next_click", lambda c, context: heard.append((c, context)))
-    made = world.select(world.click(IN_1))
+    made = world.select(world.click(IN_1), advise=True)
     ((confidence, context),) = heard
     assert torch.equal(confidence, made.selection.confidence)
     assert [view.name for view in context.scene_views] == ["front", "side"]

@@ -13,8 +13,8 @@ from splatseg.errors import InputError
 from splatseg.io.scene import load_scene, load_scene_layer, save_scene_layer
 from splatseg.prompting.prompts import AxisBox, ViewPrompt
 from splatseg.tasks import SelectOptions, select
-from splatseg.tasks._select_prompter import segmented_prompts
-from splatseg.tasks.named_models import prompter_of
+from splatseg.tasks.see import prompter_of
+from splatseg.tasks.select import segmented_prompts
 
 
 class Squares:
@@ -124,7 +124,7 @@ def test_a_selection_is_made_of_the_mask_and_says_by_whom(room) -> None:
             return MaskSet.from_dense(dense)
 
     click = ViewPrompt(view=view, points=[[view.camera.width / 4, view.camera.height / 2]])
-    options = SelectOptions(hidden=False, fill_holes=False, filter=False)
+    options = SelectOptions(post_processing="none")
     layers = {"sides": tree}
     plain = select(scene, click, layers=layers, options=options)
     asked = select(scene, click, layers=layers, options=options, prompter=Other())

@@ -93,7 +93,7 @@ def test_what_masks_became_is_kept_where_the_prompts_have_no_answer(room, capsys
 
 def only_masks(room: Path, wanted: str, monkeypatch) -> None:
     """Let the scene have no other masks."""
-    from splatseg.tasks import _select_sources as sources
+    from splatseg.tasks import work as sources
 
     names = sources.evidence_names
     others = [name for name in ("masks_sam", "masks_nested") if name != wanted]
@@ -119,7 +119,7 @@ def test_trees_come_first_then_features_then_masks_and_labels_last(room, monkeyp
     assert taken("all") == ("layer", "all")
     name = masks_of(room)
     assert taken("all", "affinity", "things", evidence=name) == ("masks", name)
-    with pytest.raises(InputError, match="expected the name of one of masks_nested, masks_sam"):
+    with pytest.raises(InputError, match=r"sets of masks by name \(masks_nested, masks_sam\)"):
         taken()
     only_masks(room, name, monkeypatch)
     assert taken("all") == ("masks", name)
@@ -138,7 +138,7 @@ def test_each_file_is_read_once_to_choose_and_the_choice_is_said_once(room, monk
         read.append(name)
         return load_scene_layer(root, name)
 
-    monkeypatch.setattr("splatseg.tasks.scene_parts.load_scene_layer", counted)
+    monkeypatch.setattr("splatseg.tasks.work.load_scene_layer", counted)
     observer = Stopping()
     made = select(scene, click(scene), observer=observer)
     assert made.source == "layer"
@@ -199,9 +199,10 @@ def test_a_scene_without_anything_says_what_to_make(room) -> None:
 def test_features_of_the_scene_folder_are_found(room) -> None:
     scene = load_scene(room)
     save_scene_layer(affinity(len(scene.gaussians)), room, "affinity")
-    made = select(load_scene(room), click(scene))
+    made = select(load_scene(room), click(scene), advise=True)
     assert (made.source, made.selection.info.options["layer"]) == ("features", "affinity")
     assert "next_click" in made.seconds
+    assert "next_click" not in select(load_scene(room), click(scene)).seconds
 
 
 def test_features_trained_as_published_are_asked_as_published(room) -> None:
@@ -221,9 +222,9 @@ def test_features_trained_as_published_are_asked_as_published(room) -> None:
     every = ["filter", "grow", "refine", "fill_holes", "hidden"]
     assert record("own") == ("fixed", None, every)
     assert record("paper") == ("adaptive", "published", ["filter", "grow"])
-    assert record("paper", grow=False) == ("adaptive", "published", ["filter"])
+    assert record("paper", post_processing="none") == ("adaptive", None, [])
     assert record("own", threshold="code") == ("code", None, every)
-    assert record("paper", post_processing="own", threshold="fixed") == ("fixed", None, every)
+    assert record("paper", post_processing="full", threshold="fixed") == ("fixed", None, every)
     assert record("own", post_processing="published")[1:] == ("published", ["filter", "grow"])
     tree = SelectOptions(post_processing="published", from_layer="all")
     labels = Labels(ids=torch.ones(count, dtype=torch.int32), confidence=torch.ones(count))
@@ -251,9 +252,8 @@ def test_thresholds_change_what_is_selected(room) -> None:
 
     def selected(rule: str) -> int:
         options = SelectOptions(
-            source="features", from_layer="own", threshold=rule, filter=False, grow=False,
-            refine=False, fill_holes=False, hidden=False,
-        )  # fmt: skip
+            source="features", from_layer="own", threshold=rule, post_processing="none"
+        )
         return select(scene, click(scene), options=options, layers=layers).selection.count
 
     assert selected("adaptive") > selected("fixed") > selected("code")

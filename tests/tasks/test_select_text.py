@@ -81,7 +81,7 @@ def test_places_bound_and_earlier_selections_combine(scene, table) -> None:
 
 
 def test_steps_and_seed_count(scene, table) -> None:
-    off = SelectOptions(filter=False, fill_holes=False)
+    off = SelectOptions(post_processing="none")
     plain = select_text(scene, [WORD], options=options(), select_options=off)
     assert "filter" not in plain.seconds
     random = options(sampling="random", initial="random")
@@ -97,7 +97,7 @@ def test_steps_and_seed_count(scene, table) -> None:
 def test_what_is_asked_for_is_there(scene) -> None:
     with pytest.raises(InputError, match="evidence: expected one of those at hand"):
         select_text(scene, [WORD], options=TextOptions(evidence="nothing"))
-    with pytest.raises(InputError, match="evidence: expected the name of one of"):
+    with pytest.raises(InputError, match="evidence: expected one of the sets of masks by name"):
         select_text(scene, [WORD], options=TextOptions(features="features_text"))
     with pytest.raises(InputError, match="features: expected features"):
         select_text(scene, [WORD], options=TextOptions(features="masks_sam", evidence="masks_sam"))
@@ -198,4 +198,7 @@ def test_bad_command_lines(folder, capsys, flags, message) -> None:
 def test_masks_are_asked_for_by_the_option_that_select_has(folder, capsys) -> None:
     assert main(["select", str(folder), "--text", WORD]) == 2
     said = capsys.readouterr().err
-    assert "--evidence: expected the name of one of masks_nested, masks_sam, got none" in said
+    assert (
+        "--evidence: expected one of the sets of masks by name (masks_nested, masks_sam), got none"
+        in said
+    )

@@ -22,7 +22,7 @@ from splatseg.io.evidence import (
     without_masked,
 )
 from splatseg.io.scene import load_scene
-from splatseg.tasks._observer import Observer
+from splatseg.tasks.work import Observer
 
 HEIGHT, WIDTH = 4, 6
 ROOM = {"evidence": "labels_semantic", "layer": "x", "complete": False}

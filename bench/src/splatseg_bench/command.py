@@ -9,9 +9,17 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from splatseg.cli._types import Backend, Json, Quiet, Seed
+from splatseg.cli._shared import (
+    Backend,
+    ConsoleObserver,
+    Json,
+    Quiet,
+    Seed,
+    plain,
+    print_result,
+    typed,
+)
 from splatseg.cli._words import listed
-from splatseg.cli._work import ConsoleObserver, plain, print_result, typed
 from splatseg.fit import Preset
 from splatseg_bench.options import BenchOptions
 from splatseg_bench.protocols import PROTOCOLS

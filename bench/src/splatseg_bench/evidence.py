@@ -11,9 +11,8 @@ from splatseg.io.evidence import TEXT_FILE, EvidenceKind, evidence_header, open_
 from splatseg.methods import Method
 from splatseg.models import What, find_family, model_names
 from splatseg.render import BackendName
-from splatseg.tasks._observer import Observer
-from splatseg.tasks.named_models import model_of, name_of
-from splatseg.tasks.see import SeeOptions, see
+from splatseg.tasks.see import SeeOptions, model_of, name_of, see
+from splatseg.tasks.work import Observer
 from splatseg_bench.options import BenchOptions
 from splatseg_bench.protocols import Protocol, RoomSwitches, StreetSwitches, TargetSwitches
 from splatseg_bench.scene import BenchmarkScene

@@ -27,12 +27,10 @@ from splatseg.methods import Method
 from splatseg.methods.voxels.words import VoxelWords
 from splatseg.prompting.prompts import ViewPrompt
 from splatseg.render import BackendName
-from splatseg.tasks._observer import Observer
-from splatseg.tasks.segment import segment
-from splatseg.tasks.segment_options import SegmentOptions
-from splatseg.tasks.select import open_selector
-from splatseg.tasks.select_options import SelectOptions
-from splatseg.tasks.select_session import SelectionSession
+from splatseg.tasks.segment import SegmentOptions, segment
+from splatseg.tasks.select import SelectionSession, open_selector
+from splatseg.tasks.sources import SelectOptions
+from splatseg.tasks.work import Observer
 from splatseg_bench.evidence import Seen, companion_for, kinds_wanted, seen_for
 from splatseg_bench.options import BenchOptions
 from splatseg_bench.protocols import Protocol, TargetSwitches

@@ -17,9 +17,8 @@ from splatseg.io.json_files import write_json
 from splatseg.methods import find_method
 from splatseg.render import BackendName
 from splatseg.report.html import Commands, Notice, Report, Table, report_html
-from splatseg.tasks._observer import SILENT, Observer
-from splatseg.tasks.new_scene import check_parent_writable
-from splatseg.tasks.score_tables import Cell, write_table
+from splatseg.tasks.figures import Cell, write_table
+from splatseg.tasks.work import SILENT, Observer, check_parent_writable
 from splatseg_bench.evidence import (
     bench_model,
     chosen_model,

@@ -16,8 +16,8 @@ from splatseg.io.scans import scan_formats
 from splatseg.io.scene import load_scene
 from splatseg.io.scene_folder import CHECKPOINT_FILE, is_scene
 from splatseg.render import BackendName
-from splatseg.tasks._observer import Observer
 from splatseg.tasks.make_scene import MakeSceneOptions, fit_capture
+from splatseg.tasks.work import Observer
 from splatseg_bench.layouts import find_layout, read_benchmark
 from splatseg_bench.layouts.replica import LAYOUT as REPLICA
 from splatseg_bench.layouts.replica import SEQUENCES
@@ -200,7 +200,6 @@ def fitted_scene(
             capture,
             folder,
             options=MakeSceneOptions(
-                preset=options.preset,
                 resume=(folder / CHECKPOINT_FILE).is_file(),
                 scans=scans,
             ),

@@ -32,8 +32,8 @@ from splatseg.methods import Method
 from splatseg.street.build import METHOD_NAME
 from splatseg.street.field import MeshField
 from splatseg.tasks.scan_labels import viewed_points
-from splatseg.tasks.street.field import save_street_field, street_field
-from splatseg.tasks.street.options import StreetOptions
+from splatseg.tasks.street_field import save_street_field, street_field
+from splatseg.tasks.street_inputs import StreetOptions
 from splatseg_bench.evidence import Seen, evidence_wanted
 from splatseg_bench.job import Job
 from splatseg_bench.maps import Scores, TrueMapSource, class_scores, keep_map

@@ -1,8 +1,8 @@
 """The command line: `splatseg COMMAND ...`.
 
-Each command is a module of this package that holds a frozen dataclass `Command` (tyro turns its
-fields into flags and the strings under them into help) and ``run(command)``. The table below is
-all that ``splatseg --help`` reads, so the list of commands appears without importing torch.
+Each command is a frozen dataclass `Command` of a module of this package (tyro turns its fields into
+flags and the strings under them into help) and a function ``run(command)``. The table below is all
+that ``splatseg --help`` reads, so the list of commands appears without importing torch.
 
 Exit status: 0 done, 2 bad input or usage, 1 everything else, Ctrl-C included.
 """
@@ -16,12 +16,10 @@ from collections.abc import Collection, Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import entry_points
-from typing import Any, Protocol, cast
+from typing import Any
 
-from splatseg.cli._pages import kept_page
-from splatseg.cli._signals import interrupted_by_signals
-from splatseg.cli._streams import prepare_streams, silence, tell
-from splatseg.cli._words import field_names, option_names, with_flags
+from splatseg.cli._streams import interrupted_by_signals, prepare_streams, silence, tell
+from splatseg.cli._words import default_config, field_names, kept_page, option_names, with_flags
 from splatseg.errors import InputError, MissingPackageError, SplatsegError, visible
 
 _MAX_UNPACKED = re.compile("--max-unpacked(=.*)?")
@@ -31,7 +29,7 @@ EXIT_FAILED = 1
 EXIT_USAGE = 2
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class CommandEntry:
     """One row of the table of commands."""
 
@@ -41,75 +39,86 @@ class CommandEntry:
     summary: str
     """What the command does, in one line of the top-level help."""
 
+    part: str = ""
+    """Where a module holds two commands: of ``part`` these are `PartCommand` and `run_part`."""
+
+    def kind_for(self, words: Sequence[str]) -> tuple[type[Any], tuple[Any, ...]]:
+        """The class of the command for its words, and how tyro reads its fields."""
+        module: Any = importlib.import_module(self.module)
+        # A command whose flags depend on its words makes its type from them.
+        command_for = getattr(module, "command_for", None)
+        if command_for is None:
+            kind = getattr(module, f"{self.part.title()}Command")
+        else:
+            kind = command_for(words)
+        return kind, getattr(module, "CONFIG", None) or default_config()
+
+    def run(self, command: object) -> None:
+        """Do what the parsed command says."""
+        module: Any = importlib.import_module(self.module)
+        getattr(module, f"run_{self.part}" if self.part else "run")(command)
+
 
 COMMANDS: dict[str, CommandEntry] = {
     "demo": CommandEntry(
-        module="splatseg.cli.demo",
-        summary="the whole pipeline on a generated room, nothing to download",
+        "splatseg.cli.demo", "the whole pipeline on a generated room, nothing to download"
     ),
     "info": CommandEntry(
-        module="splatseg.cli.info",
-        summary="what a capture, a splat file or a scene folder holds",
+        "splatseg.cli.info", "contents of a capture, a splat file or a scene folder"
     ),
-    "fit": CommandEntry(
-        module="splatseg.cli.fit",
-        summary="posed photographs and start points -> Gaussians",
-    ),
+    "fit": CommandEntry("splatseg.cli.fit", "photographs and start points -> Gaussians"),
     "import": CommandEntry(
-        module="splatseg.cli.import_",
-        summary="any splat file, with or without photographs -> a scene",
+        "splatseg.cli.fit",
+        "any splat file, with or without photographs -> a scene",
+        part="import",
     ),
     "doctor": CommandEntry(
-        module="splatseg.cli.doctor",
-        summary="what is wrong with a capture's cameras and points, and a corrected copy",
+        "splatseg.cli.info",
+        "faults in a capture's cameras and points, and a corrected copy",
+        part="doctor",
     ),
     "see": CommandEntry(
-        module="splatseg.cli.see",
-        summary="a 2D model, or evidence recorded elsewhere -> evidence of the photographs",
+        "splatseg.cli.see",
+        "a 2D model, or predictions recorded elsewhere -> evidence of the photographs",
     ),
     "segment": CommandEntry(
-        module="splatseg.cli.segment",
-        summary="evidence (label maps, masks, features) -> a layer of the scene",
+        "splatseg.cli.segment", "evidence (label maps, masks, features) -> a layer of the scene"
     ),
     "street": CommandEntry(
-        module="splatseg.cli.street",
-        summary="a drive -> a mesh field with classes, and labels of laser points",
+        "splatseg.cli.street", "a drive -> a mesh field with classes, and labels of laser points"
     ),
     "select": CommandEntry(
-        module="splatseg.cli.select",
-        summary="clicks, boxes, strokes, masks, places -> a selection of Gaussians",
+        "splatseg.cli.select", "clicks, boxes, strokes, masks, words -> a selection of Gaussians"
     ),
     "query": CommandEntry(
-        module="splatseg.cli.query",
-        summary="words -> the things that they mean, and how surely",
+        "splatseg.cli.query", "words -> the objects that answer, with probabilities"
     ),
     "render": CommandEntry(
-        module="splatseg.cli.render",
-        summary="pictures, depth and label maps of a scene's views",
+        "splatseg.cli.render", "pictures, depth and label maps of a scene's views"
     ),
     "evaluate": CommandEntry(
-        module="splatseg.cli.evaluate",
-        summary="score a layer against label maps of held-out views",
+        "splatseg.cli.evaluate", "score a layer against label maps of held-out views"
     ),
     "edit": CommandEntry(
-        module="splatseg.cli.edit",
-        summary="things removed, kept alone, copied, moved, coloured, joined -> a new scene",
+        "splatseg.cli.edit",
+        "objects removed, extracted, copied, moved, coloured, merged -> a new scene",
     ),
     "sharpen": CommandEntry(
-        module="splatseg.cli.sharpen",
-        summary="Gaussians that take sides at the boundaries of a layer -> a new scene",
+        "splatseg.cli.edit",
+        "Gaussians moved to one side of a layer's boundaries -> a new scene",
+        part="sharpen",
     ),
     "export": CommandEntry(
-        module="splatseg.cli.export",
-        summary="a scene and its labels as files that other tools read",
+        "splatseg.cli.export", "a scene and its labels as files that other tools read"
     ),
     "attach": CommandEntry(
-        module="splatseg.cli.attach",
-        summary="labels put back on splats that an editor cropped, moved or rounded",
+        "splatseg.cli.export",
+        "labels transferred to splats that an editor cropped, moved or rounded",
+        part="attach",
     ),
     "completion": CommandEntry(
-        module="splatseg.cli.completion",
-        summary="a script that completes commands and flags in bash, zsh or fish",
+        "splatseg.cli.completion",
+        "a script that completes commands and flags in bash, zsh or fish",
     ),
 }
 """Every command of this distribution, in the order of the work."""
@@ -144,15 +153,6 @@ def find_commands() -> dict[str, CommandEntry]:
             )
         found[point.name] = entry
     return found
-
-
-class CommandModule(Protocol):
-    """What a module of this package offers."""
-
-    Command: type[Any]
-
-    def run(self, command: Any, /) -> None:
-        """Do what the parsed command says."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -262,32 +262,23 @@ def _dispatch(words: list[str]) -> int:
     if page is not None:
         sys.stdout.write(page)
         return EXIT_DONE
-    module = cast("CommandModule", importlib.import_module(commands[name].module))
-    return _run(module, name, rest)
+    return _run(commands[name], name, rest)
 
 
-def _run(module: CommandModule, name: str, words: list[str]) -> int:
+def _run(entry: CommandEntry, name: str, words: list[str]) -> int:
     """Parse the words of one command and run it; tyro's own exits become our status."""
-    from splatseg.cli._pages import default_config
     from splatseg.cli._parse import parse  # here: the top-level help needs none of it
 
-    # A command whose flags depend on its words makes its type from them.
-    command_for = getattr(module, "command_for", None)
-    kind = module.Command if command_for is None else command_for(words)
+    kind, config = entry.kind_for(words)
     try:
-        command = parse(
-            kind,
-            words,
-            prog=f"splatseg {name}",
-            config=getattr(module, "CONFIG", None) or default_config(),
-        )
+        command = parse(kind, words, prog=f"splatseg {name}", config=config)
     except SystemExit as leaving:  # after --help (0) or a usage error (2)
         return leaving.code if isinstance(leaving.code, int) else EXIT_USAGE
     except InputError as error:  # options check themselves
         error.args = (with_flags(str(error), option_names(kind)),)
         raise
     try:
-        module.run(command)
+        entry.run(command)
     except (InputError, KeyboardInterrupt) as error:
         # Tasks speak of options by their names in Python.
         if error.args:

@@ -11,20 +11,17 @@ import re
 import types
 from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Union, cast, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, Union, cast, get_args, get_origin, get_type_hints
 
 import docstring_parser
 import tyro
 
 from splatseg.cli._words import names_as_flags, option_names
+from splatseg.core.options import removed_options
 from splatseg.core.typed_text import REPEATED
 from splatseg.errors import InputError, quoted
 
-_LISTS: dict[Any, type[str] | type[int] | type[float]] = {
-    tuple[str, ...]: str,
-    tuple[int, ...]: int,
-    tuple[float, ...]: float,
-}
+_SHARED = ("seed", "backend", "data", "json", "quiet")
 _ITEMS = {str: "names", int: "whole numbers", float: "numbers"}
 _PLACEHOLDERS: dict[Any, str] = {str: "NAME", int: "N", float: "X", Path: "PATH"}
 
@@ -38,12 +35,44 @@ def parse(
         SystemExit: After the help (status 0), or after words that cannot be used (2).
         InputError: If an item of a list is no number, or options refuse their values.
     """
+    _refuse_removed(command, words, config)
     shown = _readable(command, option_names(command))
     try:
         made = tyro.cli(shown, prog=prog, args=list(words), config=config)
     except _UnreadableError as error:
         raise InputError(str(error)) from error
     return _original(made, command)
+
+
+def _refuse_removed(command: type[Any], words: Sequence[str], config: tuple[Any, ...]) -> None:
+    """Say of a flag that went what to use instead: of options, and of `REMOVED` of the command."""
+    plain = tyro.conf.OmitArgPrefixes in config
+    removed = _removed(command, "", plain=plain) | dict(getattr(command, "REMOVED", {}))
+    for word in words:
+        flag = word.partition("=")[0]
+        name = flag.removeprefix("--").replace("-", "_")
+        said = removed.get(name, removed.get(name.removeprefix("no_")))
+        if flag.startswith("--") and said is not None:
+            hint = names_as_flags(said, option_names(command))
+            raise InputError(f"{flag}: this option was removed; {hint}.")
+
+
+def _removed(kind: type[Any], prefix: str, *, plain: bool) -> dict[str, str]:
+    """What to use instead of the flags that went, by their names with prefixes."""
+    found = {
+        f"{prefix}{name}": said
+        for owner in kind.__mro__
+        for name, said in removed_options(owner).items()
+    }
+    hints = get_type_hints(kind, include_extras=True)
+    for field in dataclasses.fields(kind):
+        inner, notes = _unwrapped(hints[field.name])
+        if dataclasses.is_dataclass(inner):
+            unnamed = any(_is_argument(note) and note.name == "" for note in notes)
+            bare = plain or unnamed or tyro.conf.OmitArgPrefixes in notes
+            deeper = prefix if bare else f"{prefix}{field.name}."
+            found |= _removed(cast("type[Any]", inner), deeper, plain=plain)
+    return {name: said for name, said in found.items() if name not in hints}
 
 
 class _UnreadableError(Exception):
@@ -65,7 +94,7 @@ def flowing(text: str) -> str:
 
 
 def _readable(command: type[Any], names: Collection[str]) -> type[Any]:
-    """A subclass with annotated fields; nested dataclasses likewise.
+    """A class of the same fields, annotated, which checks nothing; nested dataclasses likewise.
 
     Args:
         command: The class.
@@ -75,7 +104,10 @@ def _readable(command: type[Any], names: Collection[str]) -> type[Any]:
     kinds = get_type_hints(command)  # without the ranges that options declare, inside of lists too
     texts = _texts(command)
     made: list[tuple[str, Any, Any]] = []
-    for field in dataclasses.fields(command):
+    # What all commands have stands last in their help.
+    place = {name: index for index, name in enumerate(_SHARED)}
+    order = sorted(dataclasses.fields(command), key=lambda field: place.get(field.name, -1))
+    for field in order:
         kind: Any = kinds[field.name]
         _, notes = _unwrapped(hints[field.name])
         default = field.default
@@ -105,8 +137,9 @@ def _readable(command: type[Any], names: Collection[str]) -> type[Any]:
         if field.metadata.get(REPEATED):
             others.append(tyro.conf.UseAppendAction)
         # A flag that is given again and again has one item each time, commas and all.
-        if kind in _LISTS and tyro.conf.UseAppendAction not in others:
-            others.append(_list_of(_LISTS[kind], field.name))
+        item = _item_of(kind)
+        if item is not None and tyro.conf.UseAppendAction not in others:
+            others.append(_list_of(item, field.name))
         annotated: Any = Annotated[kind, argument]
         for note in others:
             annotated = Annotated[annotated, note]
@@ -118,20 +151,9 @@ def _readable(command: type[Any], names: Collection[str]) -> type[Any]:
             else dataclasses.field()
         )
         made.append((field.name, annotated, spec))
-    shown = dataclasses.make_dataclass(
-        command.__name__,
-        made,
-        bases=(command,),
-        namespace={"__post_init__": _unchecked},
-        frozen=True,
-        kw_only=True,
-    )
+    shown = dataclasses.make_dataclass(command.__name__, made, frozen=True, kw_only=True)
     shown.__doc__ = flowing(command.__doc__ or "")
     return shown
-
-
-def _unchecked(_: object) -> None:
-    """Options check themselves when they are copied back: tyro would make a box of the sentence."""
 
 
 def _original(value: object, kind: type[Any]) -> object:
@@ -206,6 +228,17 @@ def _texts(command: type[Any]) -> dict[str, str]:
     return found
 
 
+def _item_of(kind: Any) -> type[str] | type[int] | type[float] | None:
+    """The type of the items of a list of words or numbers; None for everything else."""
+    args = get_args(kind)
+    if get_origin(kind) is not tuple or len(args) != 2 or args[1] is not Ellipsis:
+        return None
+    item, _ = _unwrapped(args[0])
+    if get_origin(item) is Literal:
+        return str
+    return item if item in _ITEMS else None
+
+
 def _unwrapped(hint: Any) -> tuple[Any, list[Any]]:
     if get_origin(hint) is Annotated:
         kind, *notes = get_args(hint)
@@ -219,12 +252,13 @@ def _is_argument(note: object) -> bool:
 
 def _placeholder(kind: Any) -> str | None:
     """What stands for the value of a word; None leaves it to tyro."""
+    kind, _ = _unwrapped(kind)
     if get_origin(kind) in (Union, types.UnionType):
         inner = [part for part in get_args(kind) if part is not type(None)]
         return _placeholder(inner[0]) if len(inner) == 1 else None
     if get_origin(kind) is tuple and Ellipsis not in get_args(kind):
         parts = [_placeholder(part) for part in get_args(kind)]
         return None if None in parts else " ".join(part for part in parts if part is not None)
-    if kind in _LISTS:
-        return f"{_PLACEHOLDERS[_LISTS[kind]]} .."
+    if (item := _item_of(kind)) is not None:
+        return f"{_PLACEHOLDERS[item]} .."
     return _PLACEHOLDERS.get(kind)

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import tyro
 
 from splatseg.cli import find_commands
-from splatseg.cli._pages import FOLDER
+from splatseg.cli._words import FOLDER
 
 Shell = Literal["bash", "zsh", "fish"]
 
@@ -18,7 +18,7 @@ _OPTION_LINE = re.compile(r"^ +-")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Command:
-    """Print a script that completes commands, flags and methods in your shell.
+    """Print a script that completes commands, flags and methods in a shell.
 
     bash: source <(splatseg completion bash), in ~/.bashrc. zsh: the same, in ~/.zshrc, behind
     compinit. fish: splatseg completion fish | source, in config.fish.

@@ -9,21 +9,20 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from splatseg.cli._types import Backend, Json, Quiet
-from splatseg.cli._work import ConsoleObserver, print_result
+from splatseg.cli._shared import Backend, Printing, print_result
 from splatseg.report.words import counted
 from splatseg.tasks import Demo, DemoOptions, make_demo
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Command:
-    """Show the main job on a generated room, of which the truth is known.
+@dataclass(frozen=True, kw_only=True)
+class Command(Printing):
+    """Run the whole pipeline on a generated room with known truth.
 
-    Photographs of the room and class maps with a network's mistakes are generated; then what
-    fit, see, segment, render, evaluate and export do is done with them, and the command that
-    does the same is printed: classes from the maps, objects from masks that need no weights,
-    renders of held-out views, files and reports. Takes about three minutes on two cores.
-    report.html and contact_sheet.png in DIR show what came of it.
+    Photographs of the room and class maps with a network's mistakes are generated; then fit, see,
+    segment, render, evaluate and export run on them, and each command is printed: classes from
+    the maps, objects from masks that need no weights, renders of held-out views, files and
+    reports. Takes about three minutes on two cores. report.html and contact_sheet.png in DIR show
+    the results.
 
     For example:
 
@@ -35,14 +34,12 @@ class Command:
     """
 
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="DIR")] = Path("splatseg-demo")
-    """Folder for everything. One that an earlier demo made is replaced."""
+    """Folder for all results. The folder of an earlier demo is replaced."""
 
     options: Annotated[DemoOptions, tyro.conf.arg(name="")] = field(default_factory=DemoOptions)
-    """Which room, how many photographs of it, and how long it is fitted."""
+    """Room, number of photographs, and length of the fit."""
 
     backend: Backend = "auto"
-    json: Json = False
-    quiet: Quiet = False
 
 
 def run(command: Command) -> None:
@@ -51,7 +48,7 @@ def run(command: Command) -> None:
         command.output,
         options=command.options,
         backend=command.backend,
-        observer=ConsoleObserver(quiet=command.quiet, json=command.json),
+        observer=command.observer,
     )
     if command.json:
         print_result({"folder": made.folder} | made.record, [], json=True)

@@ -9,14 +9,12 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from splatseg.cli._types import Backend, Data, Field, Json, Quiet, SceneFolder, Split
-from splatseg.cli._work import ConsoleObserver, open_scene, plain, print_result
+from splatseg.cli._shared import Field, OnScene, Split, plain, print_result
 from splatseg.core import Scene
 from splatseg.io.json_files import write_json
 from splatseg.tasks import EvaluationOptions, evaluate_scene
-from splatseg.tasks.new_scene import check_parent
-from splatseg.tasks.scene_parts import scene_field
-from splatseg.tasks.score_tables import check_table_file, write_class_table, write_confusion
+from splatseg.tasks.figures import check_table_file, write_class_table, write_confusion
+from splatseg.tasks.work import check_parent, scene_field
 
 _PER_CLASS = {
     "per_class": "classes",
@@ -31,14 +29,14 @@ class _Options(EvaluationOptions):
     split: Split = "test"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Command:
+@dataclass(frozen=True, kw_only=True)
+class Command(OnScene):
     """Score a layer against the truth, and renders against the photographs.
 
-    mIoU, fwIoU and accuracy are pooled over all views and equal to those of the usual scorers;
-    the per-image mIoU is the mean over views. Predictions are drawn in the truth's own pixels.
-    Instances are matched one to one over the whole scene; panoptic quality takes a segment as
-    all its pixels in all views.
+    mIoU, fwIoU and accuracy are pooled over all views and equal those of the common scorers; the
+    per-image mIoU is the mean over views. Predictions are drawn in the truth's pixels. Instances
+    are matched one to one over the whole scene; for panoptic quality a segment is all its pixels
+    in all views. Renders are scored where all photographs are at hand.
 
     For example:
 
@@ -48,30 +46,23 @@ class Command:
 
     splatseg evaluate room --layer semantic --truth gt --table classes.tex --confusion pixels.csv
 
-    splatseg evaluate room --split train --photographs
+    splatseg evaluate room --split train
     """
 
-    scene: SceneFolder
-
     scoring: tyro.conf.OmitArgPrefixes[_Options] = field(default_factory=_Options)
-    """What is scored against what."""
+    """What is scored, and the truth."""
 
     field: Field = None
 
     table: Path | None = None
-    """Also write the scores of classes (id, name, pixels, IoU) to this file: .csv, .md or .tex."""
+    """Also write the scores of classes (id, name, pixels, IoU) to this .csv, .md or .tex file."""
 
     confusion: Path | None = None
     """Also write the confusion matrix, pixels by true class (rows) and class of the layer
-    (columns), to this file: .csv, .md or .tex."""
+    (columns), to this .csv, .md or .tex file."""
 
     json_file: Path | None = None
     """Also write what --json prints to this file."""
-
-    backend: Backend = "auto"
-    data: Data = None
-    json: Json = False
-    quiet: Quiet = False
 
 
 def run(command: Command) -> None:
@@ -80,13 +71,13 @@ def run(command: Command) -> None:
         check_parent(command.json_file)
     check_table_file("table", command.table)
     check_table_file("confusion", command.confusion)
-    scene = open_scene(command.scene, command.data)
+    scene = command.open()
     figures = evaluate_scene(
         scene,
         options=command.scoring,
         field=None if command.field is None else scene_field(scene, command.field),
         backend=command.backend,
-        observer=ConsoleObserver(quiet=command.quiet, json=command.json),
+        observer=command.observer,
     )
     figures["scene"] = str(command.scene)
     if command.field is not None:

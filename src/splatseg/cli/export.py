@@ -1,4 +1,4 @@
-"""``splatseg export``: a scene and its labels as files of other programs."""
+"""``splatseg export`` and ``splatseg attach``: labels as files of other programs, and back."""
 
 import time
 from dataclasses import dataclass, field
@@ -7,25 +7,40 @@ from typing import Annotated
 
 import tyro
 
-from splatseg.cli._types import Backend, Data, Frames, Json, Quiet, SceneFolder, SplitOrPath
-from splatseg.cli._work import ConsoleObserver, open_scene, print_result
-from splatseg.tasks import ExportOptions, export_scene
-from splatseg.tasks.export_options import What
+from splatseg.cli._shared import (
+    Frames,
+    Linear,
+    OnScene,
+    Overwrite,
+    Printing,
+    SplitOrPath,
+    Strict,
+    print_result,
+)
+from splatseg.lift import AttachOptions
+from splatseg.tasks import (
+    AttachedLayers,
+    AttachLayersOptions,
+    ExportOptions,
+    attach_layers,
+    export_scene,
+)
+from splatseg.tasks.export_labels import What
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Options(ExportOptions):
+class _Export(ExportOptions):
     split: SplitOrPath = "test"
     frames: Frames = 360
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Command:
+@dataclass(frozen=True, kw_only=True)
+class Command(OnScene):
     """Write a scene and its labels as files that other tools open.
 
     splat: the Gaussians in one file. A PLY gets the columns class_id, instance_id (int32, 0 for
     none) and confidence (float32), and a table of what the ids mean beside it, FILE.json. Other
-    formats hold no such columns. objects: a folder with one splat file an object, and
+    formats hold no such columns. objects: a folder with one splat file per object, and
     objects.json. points: a labelled point cloud, .ply, .las or .laz. coco: a folder in COCO's
     panoptic format, drawn in the views of --split. table: the objects with centroid, box,
     class, colour and confidence, .csv or .json.
@@ -41,8 +56,6 @@ class Command:
     splatseg export room -o room.las --what points --layer semantic --min-opacity 0.3
     """
 
-    scene: SceneFolder
-
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT")]
     """File to write: .ply, .compressed.ply, .splat, .spz, .sog for splats. Folder for objects and
     coco."""
@@ -50,25 +63,20 @@ class Command:
     what: What = "splat"
     """What to write: splat, objects, points, coco or table."""
 
-    export: tyro.conf.OmitArgPrefixes[_Options] = field(default_factory=_Options)
-    """Which layers are exported, and how."""
-
-    backend: Backend = "auto"
-    data: Data = None
-    json: Json = False
-    quiet: Quiet = False
+    export: tyro.conf.OmitArgPrefixes[_Export] = field(default_factory=_Export)
+    """Layers to export, and formats."""
 
 
 def run(command: Command) -> None:
     """Export a scene."""
     started = time.monotonic()
     done = export_scene(
-        open_scene(command.scene, command.data),
+        command.open(),
         command.output,
         command.what,
         options=command.export,
         backend=command.backend,
-        observer=ConsoleObserver(quiet=command.quiet, json=command.json),
+        observer=command.observer,
     )
     facts = {
         "output": done.output,
@@ -81,3 +89,84 @@ def run(command: Command) -> None:
     if done.table is not None:
         lines.append(f"what the ids mean in {done.table}")
     print_result(facts, lines, json=command.json)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Attach(AttachLayersOptions):
+    strict: Strict = False
+    linear: Linear = ()
+    overwrite: Overwrite = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class AttachCommand(Printing):
+    """Put labels back on Gaussians that an editor reordered, cropped, moved or rounded.
+
+    Each Gaussian of FILE is searched in SOURCE by position, colour, opacity, sizes and
+    orientation; moves of the whole scene or of parts are found. Gaussians that are not in SOURCE
+    get no label.
+
+    With -o NEW: a new scene with the layers and the views, whose cameras move along where the
+    whole scene was moved. With -o OUT.ply: a file with the columns class_id and confidence, and
+    the table beside it; SOURCE may then be a file that `splatseg export` wrote. Without -o: the
+    layers are written into FILE, a scene folder that `splatseg import` made; --overwrite replaces
+    layers of the same name.
+
+    For example:
+
+    splatseg attach room edited.ply -o room-edited
+
+    splatseg attach room edited.spz --layer semantic -o labelled.ply
+
+    splatseg attach room room-imported --layers semantic,objects
+
+    splatseg attach labelled.ply edited.ply -o labelled-again.ply
+    """
+
+    source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
+    """Scene folder with the labels, or a PLY file with columns of labels."""
+
+    file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
+    """What the editor wrote: a splat file of any format, or a scene folder made of it."""
+
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="OUT")] = None
+    """Scene folder to write, which must not exist yet, or a .ply file. Not needed where FILE is a
+    scene folder."""
+
+    attaching: Annotated[_Attach, tyro.conf.arg(name="")] = field(default_factory=_Attach)
+    """Layers to attach, and how much must be found."""
+
+    search: AttachOptions = field(default_factory=AttachOptions)
+    """Limits of the search."""
+
+
+def run_attach(command: AttachCommand) -> None:
+    """Attach labels."""
+    started = time.monotonic()
+    made = attach_layers(
+        command.source,
+        command.file,
+        command.output,
+        options=command.attaching,
+        attach_options=command.search,
+        observer=command.observer,
+    )
+    facts = {
+        "output": made.output,
+        "gaussians": made.gaussians,
+        "found": made.attached.report["found"],
+        "share": made.attached.share,
+        "names": list(made.names),
+        "table": made.table,
+        "seconds": round(time.monotonic() - started, 3),
+    }
+    print_result(facts, _attached_lines(made, command), json=command.json)
+
+
+def _attached_lines(made: AttachedLayers, command: AttachCommand) -> list[str]:
+    names = ", ".join(made.names)
+    if made.table is not None:
+        return [f"{made.output}: {names}", f"what the ids mean in {made.table}"]
+    if command.output is not None:
+        return [f"{made.output}: {made.gaussians} Gaussians, layers {names}"]
+    return [f"{made.output}: layers {names}"]

@@ -1,37 +1,51 @@
-"""``splatseg fit``: photographs with cameras become a scene of Gaussians."""
+"""``splatseg fit`` and ``splatseg import``: scenes of photographs, and of splat files."""
 
 import sys
-from dataclasses import dataclass, replace
+import time
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 
-from splatseg.cli._types import (
+from splatseg.cli._shared import (
     Backend,
     Format,
-    Json,
+    Linear,
     MadeSceneFolder,
     Overwrite,
-    Quiet,
+    Printing,
     Seed,
     Strict,
+    print_result,
+    typed,
 )
-from splatseg.cli._work import ConsoleObserver, print_result, typed
 from splatseg.fit import FitOptions, Preset, Strategy
 from splatseg.report.fit_report import scored_of
-from splatseg.tasks import MadeScene, MakeSceneOptions, fit_capture
+from splatseg.tasks import (
+    ImportOptions,
+    MadeScene,
+    MakeSceneOptions,
+    fit_capture,
+    import_scene,
+)
 
 _DEFAULT = FitOptions()
-_SCENE = MakeSceneOptions()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Command:
+class _Scene(MakeSceneOptions):
+    format: Format = "auto"
+    strict: Strict = False
+    overwrite: Overwrite = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Command(Printing):
     """Fit Gaussians to the training photographs of a capture, and write a scene folder.
 
-    Ctrl-C ends it early and writes what there is; --resume goes on from there, and from the
-    last checkpoint of a fit that was killed. --overwrite begins again instead.
+    Ctrl-C ends the fit early and writes the scene as it is; --resume continues from there, and
+    from the last checkpoint of a fit that was killed. --overwrite begins again instead.
 
     For example:
 
@@ -49,122 +63,62 @@ class Command:
     output: MadeSceneFolder
 
     minutes: float | None = None
-    """Length of the optimisation. Finding poses is not counted and comes before it; scores and
-    the report take up to a minute after it. What the whole took is said at the end. None is the
-    preset's."""
+    """Length of the optimisation, minutes. Finding poses comes before it and is not counted; scores
+    and the report take up to a minute after it. The total time is printed at the end. None takes
+    the preset's."""
 
     steps: int | None = None
     """Length in steps instead of minutes: same seed, same result."""
 
     max_gaussians: int | None = None
-    """Most Gaussians of the scene. None is the preset's, times the square root of how much longer
-    than the preset the fit is."""
+    """Largest number of Gaussians of the scene. None takes the preset's, times the square root of
+    how much longer than the preset the fit is."""
 
     preset: Preset = "default"
     """quick: 3 minutes, 274 000 Gaussians. default: 10 minutes, 500 000. full: the published
-    settings, 30 000 steps, up to a million Gaussians, colours with harmonics of degree 3."""
+    settings, 30 000 steps, up to a million Gaussians, spherical harmonics of degree 3."""
 
     strategy: Strategy = "mcmc"
-    """How Gaussians come and go. mcmc: the faint move to where there are others, up to the
-    number asked for. classic: cloned and split where the picture pulls at them. fixed: one stays
-    at each of the capture's points, in their order, and none comes or goes."""
+    """Densification. mcmc: faint Gaussians are relocated to others, up to the largest number.
+    classic: Gaussians are cloned and split where gradients are large. fixed: one stays at each of
+    the capture's points, in their order; none is added or removed."""
 
     start: Literal["auto", "points", "random"] = _DEFAULT.start
-    """Where Gaussians start. points: at the capture's points. random: on rays of the photographs,
-    where several of them agree. auto: at the points if there are any."""
+    """Initial positions. points: the capture's points. random: on rays of the photographs, where
+    several of them agree. auto: the points if there are any."""
 
     background: str = "random"
-    """What is behind the Gaussians: random, black, white or #rrggbb. Photographs with an alpha
-    channel are blended over it; over random, which forbids holes in dark surfaces, they are over
-    white."""
+    """Colour behind the Gaussians: random, black, white or #rrggbb. Photographs with an alpha
+    channel are blended over it; with random, which prevents holes in dark surfaces, over white."""
 
     prune_floaters: bool = _DEFAULT.prune_floaters
-    """Leave out of the finished scene what no training view needs."""
-
-    resume: bool = False
-    """Go on with the fit that was stopped in SCENE, with the same data and options; minutes or
-    steps may be others. The result is that of a fit that was never stopped."""
-
-    overwrite: Overwrite = False
-
-    checkpoint_every: float = _SCENE.checkpoint_every
-    """Seconds between two checkpoints, from which --resume goes on."""
-
-    checkpoint_steps: int | None = None
-    """Steps between two checkpoints, instead of seconds."""
-
-    keep_checkpoint: bool = False
-    """Keep the checkpoint of the finished fit, so that --resume with more minutes or steps can
-    make it longer."""
+    """Remove from the finished scene the Gaussians that no training view needs."""
 
     antialiased: bool | None = None
-    """Opacities shrink with Gaussians that are thinner than a pixel, so that they look right from
-    nearer and further away too. The scene remembers it; programs that cannot draw so show thin
-    things somewhat thicker. None is the preset's: yes, but for full."""
+    """Reduce opacities of Gaussians that are thinner than a pixel, so that they look right from
+    nearer and further away too. Recorded in the scene; programs that cannot draw so show thin
+    structures somewhat thicker. None takes the preset's: yes, but for full."""
 
     exposure: bool = _DEFAULT.exposure
-    """Give each photograph a brightness and a tint of its own, which the scene is freed of."""
+    """Fit a brightness and a tint for each photograph, which the scene does not keep."""
 
     masks: Literal["ignore", "alpha", "off"] = _DEFAULT.masks
-    """What masks of the capture mean. ignore: nothing is learned where they are 0. alpha: masks,
-    or the alpha channel of photographs, cut out what is wanted; the rest is empty. off: nothing."""
+    """Meaning of the capture's masks. ignore: nothing is learned where they are 0. alpha: masks, or
+    the alpha channel of photographs, cut out the object; the rest is empty. off: not used."""
 
     depth: Literal["off", "metric", "relative"] = _DEFAULT.depth
-    """What to learn from the capture's depth maps, or from --depth-evidence. metric: they hold
-    z-depth. relative: inverse depth of unknown scale and shift, as networks guess it from one
+    """What is learned from the capture's depth maps, or from --depth-evidence. metric: z-depth.
+    relative: inverse depth of unknown scale and shift, as networks predict it from one
     photograph."""
 
-    depth_evidence: Annotated[str | None, tyro.conf.arg(metavar="FOLDER_OR_NAME")] = None
-    """Evidence of depth, as see --what depth writes it, instead of the capture's depth maps: a
-    folder, or its name in DATA or in a scene that SCENE replaces."""
-
-    scans: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None
-    """Laser scans of the drive: the fit starts at their points and learns their depth, as with
-    --depth metric. For streets, whose far and thin things photographs alone place badly."""
-
-    points: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """A PLY file of points, or of a mesh, in the world of DATA: where the fit starts, instead of
-    the points of DATA."""
-
-    moving: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None
-    """Boxes of moving things, which are left out of training views and of scans: a JSON file, a
-    drive of KITTI-360 or a segment of Waymo."""
-
-    moving_classes: tuple[str, ...] = ()
-    """Classes of label maps whose things move, such as car pedestrian: they are left out of
-    training views."""
-
-    moving_evidence: Annotated[str | None, tyro.conf.arg(metavar="FOLDER_OR_NAME")] = None
-    """The label maps of --moving-classes: a folder, or its name in DATA or in a scene that SCENE
-    replaces. None takes the only label maps there are."""
-
-    moving_clock: Literal["recorded", "frames"] = _SCENE.moving_clock
-    """What the times of boxes are. recorded: what the data set has, such as seconds. frames: the
-    last number in the name of a view or scan."""
-
     refine_poses: bool = _DEFAULT.refine_poses
-    """Correct the poses of training views while fitting."""
+    """Correct the poses of training views during the fit."""
 
     seed: Seed = 0
     backend: Backend = "auto"
-    format: Format = "auto"
-    strict: Strict = False
 
-    poses: Literal["auto", "given", "sfm", "pointmaps"] = _SCENE.poses
-    """Where cameras come from. given: DATA. sfm: they are found from the photographs alone, by
-    structure from motion, and kept in SCENE/capture. pointmaps: from what a network such as DUSt3R
-    says of pairs of photographs, with a dense cloud to start from; for few photographs. auto: sfm
-    where DATA has none."""
-
-    pointmaps: Annotated[str | None, tyro.conf.arg(metavar="FOLDER_OR_MODEL")] = None
-    """Whose, with --poses pointmaps: a folder of recorded pointmaps, or a model of another package,
-    MODEL[=WEIGHTS][,OPTION=VALUE...]. None is DATA/pointmaps."""
-
-    frames: int = _SCENE.frames
-    """Frames to take from DATA where it is a video."""
-
-    json: Json = False
-    quiet: Quiet = False
+    capture: Annotated[_Scene, tyro.conf.arg(name="")] = field(default_factory=_Scene)
+    """How photographs are read, where cameras come from, and how a stopped fit goes on."""
 
 
 def run(command: Command) -> None:
@@ -172,30 +126,11 @@ def run(command: Command) -> None:
     made = fit_capture(
         command.data,
         command.output,
-        options=MakeSceneOptions(
-            format=command.format,
-            strict=command.strict,
-            poses=command.poses,
-            pointmaps=command.pointmaps,
-            frames=command.frames,
-            resume=command.resume,
-            overwrite=command.overwrite,
-            checkpoint_every=command.checkpoint_every,
-            checkpoint_steps=command.checkpoint_steps,
-            keep_checkpoint=command.keep_checkpoint,
-            preset=command.preset,
-            depth_evidence=command.depth_evidence,
-            scans=command.scans,
-            points=command.points,
-            moving=command.moving,
-            moving_classes=command.moving_classes,
-            moving_evidence=command.moving_evidence,
-            moving_clock=command.moving_clock,
-        ),
+        options=command.capture,
         fit_options=_options(command),
         backend=command.backend,
         command=typed(sys.argv),
-        observer=ConsoleObserver(quiet=command.quiet, json=command.json),
+        observer=command.observer,
     )
     print_result(_facts(made), _lines(made), json=command.json)
     if made.interrupted:
@@ -204,6 +139,7 @@ def run(command: Command) -> None:
 
 def _options(command: Command) -> FitOptions:
     options = replace(FitOptions.preset(command.preset), seed=command.seed)
+    scans = command.capture.scans
     options = replace(
         options,
         start=command.start,
@@ -212,7 +148,7 @@ def _options(command: Command) -> FitOptions:
         antialiased=options.antialiased if command.antialiased is None else command.antialiased,
         exposure=command.exposure,
         masks=command.masks,
-        depth="metric" if command.scans and command.depth == "off" else command.depth,
+        depth="metric" if scans and command.depth == "off" else command.depth,
         refine_poses=command.refine_poses,
     )
     options = options.with_strategy(command.strategy)
@@ -269,3 +205,68 @@ def _lines(made: MadeScene) -> list[str]:
         f"the whole took {sum(made.timings.values()):.0f} s: {parts}",
         f"report: {made.report}",
     ]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Import(ImportOptions):
+    format: Format = "auto"
+    strict: Strict = False
+    linear: Linear = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportCommand(Printing):
+    """Make a scene of a splat file, with its photographs or with virtual cameras.
+
+    With --data, a few views are drawn and compared with the photographs; a file in another
+    frame (axes, nerfstudio's transforms, another scale) is moved, and one that fits in no frame is
+    refused. Without, cameras are placed so that they cover what is visible; their views have
+    no photographs, and everything that needs none works on them.
+
+    For example:
+
+    splatseg import room.ply -o room --data capture
+
+    splatseg import chair.spz -o chair --kind object --max-views 60
+
+    splatseg import room.glb -o room --up +z --width 640
+    """
+
+    file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
+    """The splat file: PLY, compressed PLY, .splat, SPZ, SOG or glTF."""
+
+    output: MadeSceneFolder
+
+    importing: Annotated[_Import, tyro.conf.arg(name="")] = field(default_factory=_Import)
+    """The capture, or virtual cameras."""
+
+    backend: Backend = "auto"
+
+
+def run_import(command: ImportCommand) -> None:
+    """Import a splat file."""
+    started = time.monotonic()
+    made = import_scene(
+        command.file,
+        command.output,
+        options=command.importing,
+        backend=command.backend,
+        observer=command.observer,
+    )
+    scene, found = made.scene, made.alignment
+    train, test = len(scene.train_views), len(scene.test_views)
+    facts = {
+        "scene": command.output,
+        "gaussians": len(scene.gaussians),
+        "train_views": train,
+        "test_views": test,
+        "moved": None if found is None else found.moved,
+        "correlation": None if found is None else found.correlation,
+        "coverage": None if made.placed is None else made.placed.coverage,
+        "seconds": round(time.monotonic() - started, 3),
+    }
+    line = (
+        f"{command.output}: {len(scene.gaussians)} Gaussians, {train} training views, "
+        f"{test} test views"
+    )
+    print_result(facts, [line], json=command.json)

@@ -9,8 +9,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from splatseg.cli._types import Backend, Data, Frames, Json, Quiet, SceneFolder
-from splatseg.cli._work import ConsoleObserver, open_scene, print_result, typed
+from splatseg.cli._shared import Device, Downloads, Frames, OnScene, print_result, typed
 from splatseg.core import Scene, View
 from splatseg.core.models import TextFeatures
 from splatseg.errors import InputError
@@ -24,24 +23,24 @@ from splatseg.tasks import (
     draw_heat,
     write_query_report,
 )
-from splatseg.tasks.named_models import model_of
-from splatseg.tasks.scene_parts import views_asked
+from splatseg.tasks.see import model_for
+from splatseg.tasks.work import Work
 
 _LISTED = 5
 _HEAT_VIEWS = ("train",)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Command:
-    """Ask a scene for words: which things they mean, and how surely.
+@dataclass(frozen=True, kw_only=True)
+class Command(OnScene):
+    """Find the objects of a scene that answer words, with probabilities.
 
-    Features in the space of words answer (`splatseg see --model clip --what text`, or recorded
-    ones), of objects where there are masks: these are associated, and their features are told
-    apart where they share cells, once; the layer `objects` of the scene keeps them, and every
-    query after that takes milliseconds. A word that nothing in the scene answers to is unknown.
+    Features in the space of words are compared (`splatseg see --model clip --what text`, or
+    recorded ones), of objects where there are masks: these are associated, and their features
+    separated where they share cells, once; the layer `objects` of the scene keeps them, and every
+    later query takes milliseconds. A word that nothing in the scene answers is unknown.
 
-    Each word is a word of its own: a phrase goes in quotes. One word becomes a selection with
-    --layer, several become labels with an id each.
+    Each word is searched by itself: a phrase needs quotes. One word becomes a selection with
+    --layer, several become labels with one id each.
 
     For example:
 
@@ -54,24 +53,22 @@ class Command:
     splatseg query room sofa --model clip --features clip --report --heat maps --views path --video
     """
 
-    scene: SceneFolder
-
     words: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="WORDS")]
     """Words or phrases."""
 
     layer: str | None = None
-    """Also write what answers as this layer of the scene: a selection of one word, labels of
-    several."""
+    """Also write the answer as this layer of the scene: a selection of one word, labels of several
+    words."""
 
     picture: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """Also write DIR/WORD_RANK.png: each thing in the view that shows most of it."""
+    """Also write DIR/WORD_RANK.png: each object in the view that shows most of it."""
 
     heat: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """Also write DIR/WORD/VIEW.png: the probability of each word over the views."""
+    """Also write DIR/WORD/VIEW.png: the probability of each word in the views."""
 
     views: Annotated[tuple[str, ...], tyro.conf.arg(metavar="VIEWS")] = _HEAT_VIEWS
-    """Views of the heat maps: train, all, path (a smooth path near the cameras), or names by comma
-    or by space."""
+    """Views of the heat maps: train, all, path (a smooth path near the cameras), or names,
+    separated by commas or spaces."""
 
     frames: Frames = 360
 
@@ -79,48 +76,50 @@ class Command:
     """Also write a film of each word's heat maps, DIR/WORD.mp4. Needs splatseg[video]."""
 
     fps: float = 24.0
-    """Frames a second of --video."""
+    """Frames per second of --video."""
 
     report: bool = False
-    """Also write SCENE/reports/query.html and query.json: what answers, with pictures."""
+    """Also write SCENE/reports/query.html and query.json: the answers, with pictures."""
 
     top: int = _LISTED
-    """Things of a word that are listed and drawn, at most."""
+    """Largest number of objects per word that are listed and drawn."""
 
     model: Annotated[str | None, tyro.conf.arg(metavar="MODEL")] = None
-    """Who encodes the words: the model that the features were made with, as
+    """Model that encodes the words, the one that made the features:
     NAME[=WEIGHTS][,OPTION=VALUE...], such as clip. None takes the vectors of words that were
-    recorded with the features. To features from before its last layers (`see --model lseg --what
-    features`) it applies these, once for each voxel or Gaussian."""
+    recorded with the features. Features from before its last layers (`see --model lseg --what
+    features`) pass these once per voxel or Gaussian."""
 
-    download: bool = False
-    """Fetch weights that are not on this machine; what and how much is said before."""
-
-    device: str = "auto"
-    """Where the model runs: cpu, cuda, cuda:1. auto takes cuda where there is one."""
+    download: Downloads = False
+    device: Device = "auto"
 
     options: tyro.conf.OmitArgPrefixes[QueryOptions] = field(default_factory=QueryOptions)
-    """Who answers, and how sure is sure."""
-
-    backend: Backend = "auto"
-    data: Data = None
-    json: Json = False
-    quiet: Quiet = False
+    """What answers, and from which probability."""
 
 
 def run(command: Command) -> None:
     """Query a scene."""
     started = time.monotonic()
-    observer = ConsoleObserver(quiet=command.quiet, json=command.json)
+    observer = command.observer
     if not command.words:
         raise InputError("words: expected words or phrases, got none.")
     if command.top < 1:
         raise InputError(f"top: expected at least 1, got {command.top}.")
     if command.layer is not None:
         check_name("layer", command.layer)
-    scene = open_scene(command.scene, command.data)
+    scene = command.open()
     views = _views(command, scene)
-    encoder = None if command.model is None else _encoder(command, observer)
+    encoder = None
+    if command.model is not None:
+        encoder = model_for(
+            "model",
+            command.model,
+            TextFeatures,
+            "encodes words, such as clip",
+            download=command.download,
+            device=command.device,
+            report=observer.note,
+        )
     writes = ["layers", *(["reports"] if command.report else [])]
     with work_on_scene(command.scene, "query", writes=writes):
         session = QuerySession(
@@ -137,7 +136,8 @@ def run(command: Command) -> None:
         milliseconds = 1000 * (time.monotonic() - asked)
         facts, lines = _answered(answers, command.top)
         if command.layer is not None:
-            made = answers.labels() if _several(command, answers) else answers.selection()
+            several = len(answers.words) > 1 or command.options.every
+            made = answers.labels() if several else answers.selection()
             facts["layer"] = save_scene_layer(made, command.scene, command.layer)
             lines.append(str(facts["layer"]))
         if command.report:
@@ -154,10 +154,6 @@ def run(command: Command) -> None:
     print_result(facts, lines, json=command.json)
 
 
-def _several(command: Command, answers: Answers) -> bool:
-    return len(answers.words) > 1 or command.options.every
-
-
 def _views(command: Command, scene: Scene) -> tuple[View, ...]:
     """Those of the heat maps."""
     if command.heat is None:
@@ -166,22 +162,7 @@ def _views(command: Command, scene: Scene) -> tuple[View, ...]:
         if command.views != _HEAT_VIEWS:
             raise InputError("views: expected --heat, whose maps are of these views, with it.")
         return ()
-    return views_asked(scene, _names(command.views), frames=command.frames)
-
-
-def _names(views: tuple[str, ...]) -> tuple[str, ...]:
-    return tuple(name for word in views for name in word.split(",") if name)
-
-
-def _encoder(command: Command, observer: ConsoleObserver) -> TextFeatures:
-    if command.model is None:
-        raise InputError("model: expected the name of one, got none.")
-    model = model_of(
-        command.model, download=command.download, device=command.device, report=observer.note
-    )
-    if not isinstance(model, TextFeatures):
-        raise InputError(f"model: expected one that encodes words, such as clip, got {model.name}.")
-    return model
+    return Work(scene=scene).views(command.views, frames=command.frames)
 
 
 def _answered(answers: Answers, top: int) -> tuple[dict[str, Any], list[str]]:

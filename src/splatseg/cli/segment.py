@@ -10,9 +10,8 @@ from typing import Annotated, Any
 import torch
 import tyro
 
-from splatseg.cli._types import Backend, Data, Json, Overwrite, Quiet, SceneFolder, Seed
+from splatseg.cli._shared import OnScene, Overwrite, Seed, print_result, typed
 from splatseg.cli._words import option_value
-from splatseg.cli._work import ConsoleObserver, open_scene, print_result, typed
 from splatseg.core import UNLABELLED, Features, Labels, Scene, Selection, VoxelFeatures
 from splatseg.core.instance_tree import layer_kind
 from splatseg.errors import InputError
@@ -57,12 +56,12 @@ task, which says why."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Command:
-    """Lift what was seen in photographs onto the Gaussians: evidence becomes a layer.
+class Command(OnScene):
+    """Lift evidence of the photographs onto the Gaussians: it becomes a layer.
 
-    The layer is written to SCENE/layers. An older layer of the same name is replaced. Ctrl-C
-    ends a method that trains and keeps where it was in SCENE/training; --resume goes on from
-    there, and from the last checkpoint of one that was killed.
+    The layer is written to SCENE/layers and replaces an older layer of the same name. Ctrl-C ends
+    a method that trains and keeps its state in SCENE/training; --resume continues from there, and
+    from the last checkpoint of a training that was killed.
 
     For example:
 
@@ -73,32 +72,25 @@ class Command:
     splatseg segment room --method vote --evidence labels_tracked --views all --json
     """
 
-    scene: SceneFolder
-
     method: Annotated[str, tyro.conf.arg(metavar="METHOD")]
-    """How. `splatseg segment --method METHOD --help` shows the options of one."""
+    """Method to use. `splatseg segment --method METHOD --help` shows its options."""
 
     shared: tyro.conf.OmitArgPrefixes[_Shared] = field(default_factory=_Shared)
-    """What every method shares."""
+    """Options that all methods share."""
 
     export: bool = False
-    """Also write SCENE/exports/LAYER: one splat file an object, a table of objects, all
-    Gaussians with their labels as columns, and label maps of all views."""
+    """Also write SCENE/exports/LAYER: one splat file per object, a table of objects, all Gaussians
+    with their labels as columns, and label maps of all views."""
 
     report: bool = False
     """Also write SCENE/reports/LAYER.html and LAYER.json: a picture of each object, views,
     confidence, coverage and conflicts."""
 
     truth: Path | None = None
-    """Folder of true maps, shown and scored in the report."""
-
-    backend: Backend = "auto"
-    data: Data = None
-    json: Json = False
-    quiet: Quiet = False
+    """Folder of true maps, which are shown and scored in the report."""
 
     checkpoint: tyro.conf.OmitArgPrefixes[_Checkpoints] = field(default_factory=_Checkpoints)
-    """How a training that was stopped goes on."""
+    """How a stopped training goes on."""
 
     completion: CompletionOptions = field(default_factory=CompletionOptions)
     """How neighbours' labels spread."""
@@ -125,7 +117,7 @@ def command_for(words: Sequence[str]) -> type[Any]:
     ]
     own: list[tuple[str, Any, Any]] = [("options", options, field(default=default))]
     if method.published_differs:
-        own.append(_shared_that_differs(method.published_differs))
+        own.append(_shared_with(method.published_differs))
     made = make_dataclass(
         "Command",
         own if method.resumes else [*own, _HIDDEN_CHECKPOINTS],
@@ -137,9 +129,9 @@ def command_for(words: Sequence[str]) -> type[Any]:
     return made
 
 
-def _shared_that_differs(differs: str) -> tuple[str, Any, Any]:
+def _shared_with(differs: str) -> tuple[str, Any, Any]:
     """What methods share, with a --published that says how the setting differs from the paper's."""
-    said = f"The method as its authors published it: their options, and no completion. {differs}"
+    said = f"Use the method's published setting: the authors' options, no completion. {differs}"
     told = Annotated[bool, tyro.conf.arg(help=said)]
     shared = make_dataclass(
         "Shared", [("published", told, field(default=False))], bases=(_Shared,), frozen=True,
@@ -165,8 +157,8 @@ def _with_summaries() -> type[Any]:
 def run(command: Command) -> None:
     """Segment a scene."""
     started = time.monotonic()
-    observer = ConsoleObserver(quiet=command.quiet, json=command.json)
-    scene = open_scene(command.scene, command.data)
+    observer = command.observer
+    scene = command.open()
     opened = time.monotonic() - started
     truth = None if command.truth is None else open_evidence(command.truth)
     method = find_method(command.method)
@@ -195,9 +187,7 @@ def run(command: Command) -> None:
         timings = {"load": opened}
         files: tuple[Exported, ...] = ()
         if command.export:
-            files = _export(
-                command, scene, result, observer, lines=lines, made=made, timings=timings
-            )
+            files = _export(command, scene, result, lines=lines, made=made, timings=timings)
         if command.report:
             where = report_layer(
                 scene,
@@ -219,7 +209,6 @@ def _export(
     command: Command,
     scene: Scene,
     result: Segmentation,
-    observer: ConsoleObserver,
     *,
     lines: list[str],
     made: dict[str, Any],
@@ -233,7 +222,7 @@ def _export(
         result.name,
         result.layer,
         backend=command.backend,
-        observer=observer,
+        observer=command.observer,
     )
     timings["export"] = time.monotonic() - began
     lines += [f"{file.summary} in {file.output}" for file in files]

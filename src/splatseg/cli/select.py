@@ -1,34 +1,53 @@
-"""``splatseg select``: clicks, boxes, strokes, masks and places become a selection."""
+"""``splatseg select``: clicks, boxes, strokes, masks, words and places become a selection."""
 
+import math
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
+import numpy as np
+import torch
 import tyro
+from torch import Tensor
 
-from splatseg.cli._prompt_words import PromptWords
-from splatseg.cli._select_text import selected_by_text, word_facts, word_lines
-from splatseg.cli._types import Backend, Data, Json, Quiet, SceneFolder, Seed, SelectLevel
-from splatseg.cli._work import ConsoleObserver, open_scene, print_result
-from splatseg.core import PromptableMasks, Scene, Selection
+from splatseg.cli._shared import Device, Downloads, OnScene, Seed, print_result
+from splatseg.core import PromptableMasks, Scene, Selection, View
 from splatseg.core.instance_tree import layer_kind
+from splatseg.core.models import GroundedMasks, TextFeatures
 from splatseg.errors import InputError
+from splatseg.io.foreign import reading
+from splatseg.io.images import open_image
 from splatseg.io.scene import save_scene_layer
 from splatseg.io.scene_folder import work_on_scene
-from splatseg.prompting.prompts import AxisBox, Ball, SelectionPrompt, Similar
+from splatseg.methods.prompt import PromptOptions
+from splatseg.prompting.prompts import (
+    AxisBox,
+    Ball,
+    Lasso,
+    SelectionPrompt,
+    Similar,
+    Solid,
+    ViewPrompt,
+)
 from splatseg.tasks import (
     Selected,
     SelectionSession,
     SelectMode,
     SelectOptions,
+    TextModels,
+    TextOptions,
     check_selection_file,
     draw_selection,
     save_selected_splats,
+    select_text,
     text_prompts,
 )
-from splatseg.tasks.named_models import prompter_of
-from splatseg.tasks.scene_parts import whole_layer
+from splatseg.tasks.see import model_for, prompter_of
+from splatseg.tasks.work import Work
+
+_T = TypeVar("_T")
 
 _BASES: dict[str, SelectMode] = {
     "add_to": "add",
@@ -39,7 +58,10 @@ _BASES: dict[str, SelectMode] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Options(SelectOptions):
-    granularity: SelectLevel = "auto"
+    granularity: Annotated[str, tyro.conf.arg(metavar="LEVEL")] = "auto"
+    """Size of what a click selects: group, object, part, or a number from 0 (groups) by 0.5
+    (objects) to 1 (the finest parts). auto: chosen by the source."""
+
     mode: Annotated[SelectMode, tyro.conf.Suppress] = "new"
     seed: Seed = 0
 
@@ -47,17 +69,23 @@ class _Options(SelectOptions):
 _Repeated = tyro.conf.UseAppendAction
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Command:
-    """Select a thing by what you show of it: the Gaussians that belong to it become a layer.
+_Pixel = Annotated[tuple[str, ...], _Repeated, tyro.conf.arg(metavar="[VIEW:]X,Y")]
+_Image = Annotated[tuple[str, ...], _Repeated, tyro.conf.arg(metavar="[VIEW:]PNG")]
+_Model = Annotated[str | None, tyro.conf.arg(metavar="MODEL")]
+_Layer = Annotated[str | None, tyro.conf.arg(metavar="LAYER")]
 
-    What is shown in views is answered from what the scene has: masks that `splatseg see` made,
+
+@dataclass(frozen=True, kw_only=True)
+class Command(OnScene):
+    """Select an object by prompts: the Gaussians that belong to it become a layer.
+
+    Prompts in views are answered from what the scene has: masks that `splatseg see` made,
     features, or a layer of `splatseg segment`. Pixels have x to the right and y down from the top
     left corner. Places (--box-3d, --sphere, --lasso) bound the answer, and alone select all
     inside.
 
-    In the scene the selection becomes SCENE/layers/NAME.npz; an older layer of the name is
-    replaced. `splatseg render --what NAME`, `edit --layer NAME` and `export --layer NAME` take it.
+    The selection becomes SCENE/layers/NAME.npz and replaces an older layer of the name. `splatseg
+    render --what NAME`, `edit --layer NAME` and `export --layer NAME` take it.
 
     For example:
 
@@ -72,102 +100,95 @@ class Command:
     splatseg select room --text "red mug" --layer mug --picture found
     """
 
-    scene: SceneFolder
-
     layer: str = "selection"
-    """Name of the layer that is written."""
+    """Name of the layer to write."""
 
     view: str | None = None
     """View of all prompts that name none. VIEW:X,Y is a point in another."""
 
-    point: Annotated[tuple[str, ...], _Repeated, tyro.conf.arg(metavar="[VIEW:]X,Y")] = ()
-    """A pixel on the thing. May be given again and again, as all prompts below."""
+    point: _Pixel = ()
+    """Pixel on the object. May be repeated, as all prompts below."""
 
-    negative: Annotated[tuple[str, ...], _Repeated, tyro.conf.arg(metavar="[VIEW:]X,Y")] = ()
-    """A pixel on what it is not."""
+    negative: _Pixel = ()
+    """Pixel that is not on the object."""
 
     box: Annotated[tuple[str, ...], _Repeated, tyro.conf.arg(metavar="[VIEW:]X0,Y0,X1,Y1")] = ()
-    """A box that the thing lies inside."""
+    """Box around the object."""
 
-    mask: Annotated[tuple[str, ...], _Repeated, tyro.conf.arg(metavar="[VIEW:]PNG")] = ()
-    """An image of the view's size, black where the thing is not."""
+    mask: _Image = ()
+    """Image of the view's size, black outside the object."""
 
-    scribble: Annotated[tuple[str, ...], _Repeated, tyro.conf.arg(metavar="[VIEW:]PNG")] = ()
-    """An image of the view's size with strokes on the thing, on black or transparent."""
+    scribble: _Image = ()
+    """Image of the view's size with strokes on the object, on black or transparent."""
 
-    negative_scribble: Annotated[
-        tuple[str, ...], _Repeated, tyro.conf.arg(metavar="[VIEW:]PNG")
-    ] = ()
-    """The same with strokes on what it is not."""
+    negative_scribble: _Image = ()
+    """The same with strokes outside the object."""
 
     lasso: Annotated[tuple[str, ...], _Repeated, tyro.conf.arg(metavar="[VIEW:]X,Y,X,Y,...")] = ()
-    """A polygon in a view: what lies behind it, near and far."""
+    """Polygon in a view: all Gaussians behind it, near and far."""
 
     box_3d: tuple[float, float, float, float, float, float] | None = None
-    """Least x, y, z, then largest x, y, z, world, scene units."""
+    """Box in the world: smallest x, y, z, then largest x, y, z, scene units."""
 
     sphere: tuple[float, float, float, float] | None = None
-    """Centre x, y, z and radius, world, scene units."""
+    """Ball in the world: centre x, y, z and radius, scene units."""
 
     text: Annotated[tuple[str, ...], _Repeated, tyro.conf.arg(metavar="WORDS")] = ()
-    """Words or a phrase that the thing answers to, instead of clicks: found by recorded features
-    and masks of the views, or by models. `splatseg segment --method prompt` has more options."""
+    """Word or phrase for the object, instead of clicks: found by recorded features and masks of the
+    views, or by models. `splatseg segment --method prompt` has more options."""
 
     objects: Literal["one", "all"] = "one"
-    """With --text: the surest object, or all that answer."""
+    """With --text: select the object with the highest probability, or all that answer."""
 
     features: str | None = None
     """With --text: evidence of features in the space of words. None takes the only one."""
 
-    grounder: Annotated[str | None, tyro.conf.arg(metavar="MODEL")] = None
-    """With --text: a model that finds words in photographs, such as langsam."""
+    grounder: _Model = None
+    """With --text: model that finds words in photographs, such as langsam."""
 
-    encoder: Annotated[str | None, tyro.conf.arg(metavar="MODEL")] = None
+    encoder: _Model = None
     """With --text: the model that made the features, for words that were not recorded."""
 
     like: Annotated[tuple[str, ...], _Repeated, tyro.conf.arg(metavar="LAYER")] = ()
-    """A layer that is a selection: all things like it."""
+    """Layer that is a selection: select all objects similar to it."""
 
-    add_to: Annotated[str | None, tyro.conf.arg(metavar="LAYER")] = None
-    """A selection that this one is added to."""
+    add_to: _Layer = None
+    """Selection that this one is added to."""
 
-    subtract_from: Annotated[str | None, tyro.conf.arg(metavar="LAYER")] = None
-    """A selection that this one is taken away from."""
+    subtract_from: _Layer = None
+    """Selection that this one is subtracted from."""
 
-    intersect: Annotated[str | None, tyro.conf.arg(metavar="LAYER")] = None
-    """A selection of which only what is in this one, too, stays."""
+    intersect: _Layer = None
+    """Selection that this one is intersected with."""
 
-    prompter: Annotated[str | None, tyro.conf.arg(metavar="MODEL")] = None
-    """Who turns points and boxes into masks of their views first: a model that answers points as
-    NAME[=WEIGHTS][,OPTION=VALUE...], such as sam, or recorded masks, by name or folder."""
+    prompter: _Model = None
+    """Model that turns points and boxes into masks of their views first, such as sam:
+    NAME[=WEIGHTS][,OPTION=VALUE...]; or recorded masks, by name or folder."""
 
-    download: bool = False
-    """Fetch weights that are not on this machine; what and how much is said before."""
+    download: Downloads = False
+    device: Device = "auto"
 
-    device: str = "auto"
-    """Where the prompter runs: cpu, cuda, cuda:1. auto takes cuda where there is one."""
+    next_click: bool = False
+    """Also compute where another click would change most. Followed on measured scenes, the advice
+    did not raise the IoU."""
 
     save: Path | None = None
     """Also write the selected Gaussians alone: a splat file such as mug.ply, or a folder, in which
     it becomes NAME.ply."""
 
     picture: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """Also write DIR/VIEW.png for each view of a prompt: the selection outlined, points marked."""
+    """Also write DIR/VIEW.png for each view of a prompt, with the selection outlined and points
+    marked."""
 
-    options: tyro.conf.OmitArgPrefixes[_Options] = field(default_factory=_Options)
-    """How."""
-
-    backend: Backend = "auto"
-    data: Data = None
-    json: Json = False
-    quiet: Quiet = False
+    selecting: tyro.conf.OmitArgPrefixes[_Options] = field(default_factory=_Options)
+    """Source of the selection, and its post-processing."""
 
 
 def run(command: Command) -> None:
     """Select in a scene."""
     started = time.monotonic()
-    observer = ConsoleObserver(quiet=command.quiet, json=command.json)
-    scene = open_scene(command.scene, command.data)
+    observer = command.observer
+    scene = command.open()
     _check_text(command)
     prompts = _prompts(command, scene)
     base, mode = _base(command, scene)
@@ -182,23 +203,12 @@ def run(command: Command) -> None:
         )
     saved = None if command.save is None else check_selection_file(command.save, command.layer)
     with work_on_scene(command.scene, "select", writes=["layers"]):
-        options = replace(command.options, mode=mode)
+        options = replace(command.selecting, mode=mode)
         if command.text:
-            made = selected_by_text(
-                command,
-                scene,
-                prompts,
-                options,
-                prompter=prompter,
-                base=base,
-                observer=observer,
-                report=observer.note,
-            )
+            made = _by_text(command, scene, prompts, options, prompter=prompter, base=base)
             prompts += text_prompts(made.selection, scene)
         else:
-            made = _clicked(
-                command, scene, prompts, options, prompter=prompter, base=base, observer=observer
-            )
+            made = _clicked(command, scene, prompts, options, prompter=prompter, base=base)
         path = save_scene_layer(made.selection, command.scene, command.layer)
     facts = _facts(made, command.layer, path)
     lines = [*_lines(made), str(path)]
@@ -235,18 +245,77 @@ def _clicked(
     *,
     prompter: PromptableMasks | None,
     base: Selection | None,
-    observer: ConsoleObserver,
 ) -> Selected:
     session = SelectionSession(
-        scene, options=options, prompter=prompter, backend=command.backend, observer=observer
+        scene,
+        options=options,
+        prompter=prompter,
+        backend=command.backend,
+        observer=command.observer,
     )
     try:
         with session:
-            return session.select(prompts, base=base)
+            return session.select(prompts, base=base, advise=command.next_click)
     finally:
         # Masks take a while to associate: their tree is kept, even where it has no answer.
         for name, layer in session.made_layers.items():
             save_scene_layer(layer, command.scene, name)
+
+
+def _by_text(
+    command: Command,
+    scene: Scene,
+    prompts: list[SelectionPrompt],
+    options: SelectOptions,
+    *,
+    prompter: PromptableMasks | None,
+    base: Selection | None,
+) -> Selected:
+    """Select by words, within places."""
+    places: list[Solid] = []
+    for prompt in prompts:
+        if isinstance(prompt, ViewPrompt | Similar):
+            raise InputError(
+                "text: goes with places (--box-3d, --sphere, --lasso) and no other prompts; select "
+                "in two steps with --add-to, --subtract-from or --intersect."
+            )
+        places.append(prompt)
+    if options.source != "auto" or options.from_layer is not None:
+        raise InputError("source, from_layer: go with clicks; words are found by features.")
+    return select_text(
+        scene,
+        command.text,
+        options=TextOptions(
+            features=command.features,
+            evidence=options.evidence,
+            prompt=PromptOptions(objects=command.objects),
+        ),
+        select_options=options,
+        models=TextModels(
+            grounder=_model(command, "grounder", GroundedMasks, "finds words in images"),
+            prompter=prompter,
+            encoder=_model(command, "encoder", TextFeatures, "encodes words"),
+        ),
+        places=places,
+        base=base,
+        backend=command.backend,
+        observer=command.observer,
+    )
+
+
+def _model(command: Command, option: str, protocol: type[_T], does: str) -> _T | None:
+    named = getattr(command, option)
+    if named is None:
+        return None
+    return model_for(
+        option,
+        named,
+        protocol,
+        does,
+        download=command.download,
+        device=command.device,
+        report=command.observer.note,
+    )
 
 
 def _prompts(command: Command, scene: Scene) -> list[SelectionPrompt]:
@@ -286,7 +355,7 @@ def _base(command: Command, scene: Scene) -> tuple[Selection | None, SelectMode]
 
 
 def _selection(flag: str, scene: Scene, name: str) -> Selection:
-    layer = whole_layer(scene, name, option=flag)
+    layer = Work(scene=scene).layer(name, option=flag)
     if not isinstance(layer, Selection):
         kind = layer_kind(layer)
         raise InputError(f"{flag}: expected a layer that is a selection, {name!r} is of {kind}.")
@@ -304,7 +373,7 @@ def _facts(made: Selected, name: str, path: Path) -> dict[str, Any]:
         "selected": made.selection.count,
         "confidence": None if mean is None else round(mean, 4),
         "source": made.source,
-        "words": word_facts(made),
+        "words": _word_facts(made),
         "next_click": None
         if hint is None
         else {
@@ -326,7 +395,11 @@ def _lines(made: Selected) -> list[str]:
         f"{made.selection.count} of {len(made.selection)} Gaussians{by}{sure}; "
         f"{sum(made.seconds.values()):.2f} s"
     ]
-    lines += word_lines(made)
+    lines += [
+        f"{one['word']}: {one['probability']:.1%} sure, masks in {one['masked_views']} of "
+        f"{one['projected_views']} views"
+        for one in _word_facts(made)
+    ]
     lines += [f"note: {warning}" for warning in made.warnings]
     if (hint := made.next_click) is not None:
         x, y = (float(v) for v in hint.point)
@@ -335,3 +408,131 @@ def _lines(made: Selected) -> list[str]:
             f"--negative where it is something else (now {100 * float(hint.probability):.0f} % in)"
         )
     return lines
+
+
+def _word_facts(made: Selected) -> list[dict[str, Any]]:
+    """Of each object that answers: its word, how surely, and in how many views it has a mask."""
+    found: Any = made.selection.info.details.get("prompts", [])
+    keys = ("word", "probability", "projected_views", "masked_views")
+    return [{key: one[key] for key in keys} for one in found if "word" in one]
+
+
+@dataclass
+class _Gathered:
+    """What was said of one view."""
+
+    view: View
+    points: list[list[float]] = field(default_factory=list[list[float]])
+    positive: list[bool] = field(default_factory=list[bool])
+    box: list[float] | None = None
+    mask: Tensor | None = None
+    scribble: Tensor | None = None
+    negative_scribble: Tensor | None = None
+
+    def prompt(self) -> ViewPrompt:
+        return ViewPrompt(
+            view=self.view,
+            points=torch.tensor(self.points).reshape(-1, 2),
+            positive=torch.tensor(self.positive, dtype=torch.bool),
+            box=None if self.box is None else torch.tensor(self.box),
+            mask=self.mask,
+            scribble=self.scribble,
+            negative_scribble=self.negative_scribble,
+        )
+
+
+class PromptWords:
+    """Reads prompts and gathers them by view.
+
+    Args:
+        scene: The scene, whose views they name.
+        view: The view of what names none.
+    """
+
+    def __init__(self, scene: Scene, view: str | None) -> None:
+        self._scene = scene
+        self._names = {one.name for one in scene.views}
+        self._view = None if view is None else scene.view(view)
+        self._gathered: dict[str, _Gathered] = {}
+
+    def add_points(self, flag: str, words: Sequence[str], *, positive: bool) -> None:
+        """Points of one sign."""
+        for word in words:
+            view, rest = self._of_view(flag, word)
+            self._in(view).points.append(_numbers(flag, rest, 2))
+            self._in(view).positive.append(positive)
+
+    def add_boxes(self, flag: str, words: Sequence[str]) -> None:
+        """Boxes x0, y0, x1, y1, at most one a view."""
+        for word in words:
+            view, rest = self._of_view(flag, word)
+            self._in(view).box = self._once(flag, view, self._in(view).box, _numbers(flag, rest, 4))
+
+    def add_images(self, flag: str, name: str, words: Sequence[str]) -> None:
+        """Masks or strokes from images: what is not black, and not transparent.
+
+        Args:
+            flag: The flag, for messages.
+            name: The field of `ViewPrompt`.
+            words: Files, at most one a view.
+        """
+        for word in words:
+            view, rest = self._of_view(flag, word)
+            held = getattr(self._in(view), name)
+            setattr(self._in(view), name, self._once(flag, view, held, _read_mask(Path(rest))))
+
+    def lassos(self, flag: str, words: Sequence[str]) -> list[Lasso]:
+        """Polygons of views: x, y, x, y and so on."""
+        found: list[Lasso] = []
+        for word in words:
+            view, rest = self._of_view(flag, word)
+            numbers = _numbers(flag, rest, None)
+            if len(numbers) % 2 or len(numbers) < 6:
+                raise InputError(
+                    f"{flag}: expected X,Y of three corners or more, got {len(numbers)} numbers."
+                )
+            found.append(Lasso(view=view, polygon=torch.tensor(numbers).reshape(-1, 2)))
+        return found
+
+    def prompts(self) -> list[ViewPrompt]:
+        """One a view, in the order that views were named in."""
+        return [gathered.prompt() for gathered in self._gathered.values()]
+
+    def _in(self, view: View) -> _Gathered:
+        return self._gathered.setdefault(view.name, _Gathered(view=view))
+
+    def _of_view(self, flag: str, word: str) -> tuple[View, str]:
+        """The view that a word names, or the common one, and the rest of the word."""
+        name, colon, rest = word.rpartition(":")
+        if colon and (name in self._names or not Path(word).exists()):
+            return self._scene.view(name), rest
+        if self._view is None:
+            raise InputError(f"{flag}: expected --view, or VIEW:{word}, got neither.")
+        return self._view, word
+
+    @staticmethod
+    def _once(flag: str, view: View, held: object, new: _T) -> _T:
+        if held is not None:
+            raise InputError(f"{flag}: expected at most one in view {view.name}, got two.")
+        return new
+
+
+def _numbers(flag: str, text: str, count: int | None) -> list[float]:
+    wanted = "numbers" if count is None else f"{count} numbers"
+    try:
+        numbers = [float(word) for word in text.split(",")]
+    except ValueError:
+        numbers = []
+    fits = numbers and all(map(math.isfinite, numbers)) and count in (None, len(numbers))
+    if not fits:
+        raise InputError(f"{flag}: expected {wanted} joined by commas, got {text!r}.")
+    return numbers
+
+
+def _read_mask(path: Path) -> Tensor:
+    """Pixels of an image that are neither black nor transparent."""
+    with open_image(path) as image, reading(path, "an image"):
+        has_alpha = "A" in image.getbands() or "transparency" in image.info
+        colours = np.asarray(image.convert("RGBA" if has_alpha else "RGB"))
+    lit = colours[..., :3].max(axis=2) > 0
+    return torch.from_numpy(lit & (colours[..., 3] > 0) if has_alpha else lit)

@@ -1,18 +1,15 @@
-"""The default way from label maps to labels of Gaussians: votes, relabelling, completion."""
+"""The default way from label maps to labels of Gaussians: votes, and relabelling."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from splatseg.core import UNLABELLED, ClassTable, Gaussians, Labels, LabelSource, View
-from splatseg.lift.completion.complete import CompletionOptions, complete
+from splatseg.core import ClassTable, Gaussians, Labels, LabelSource, View
 from splatseg.lift.mass.confusion import DEFAULT_CONFUSION, ConfusionOptions, correct_confusion
 from splatseg.lift.mass.uplift import UpliftOptions, uplift
 from splatseg.render import RenderOptions
 
 _CANDIDATES = 8
 """Ids of each Gaussian that relabelling chooses from."""
-
-_DEFAULT_COMPLETION = CompletionOptions()
 
 
 def lift_labels(
@@ -22,16 +19,15 @@ def lift_labels(
     *,
     options: UpliftOptions | None = None,
     confusion: ConfusionOptions | None = DEFAULT_CONFUSION,
-    completion: CompletionOptions | None = _DEFAULT_COMPLETION,
     classes: ClassTable | None = None,
     render_options: RenderOptions | None = None,
     backend: str = "auto",
     progress: Callable[[int, int], None] | None = None,
 ) -> Labels:
-    """Label Gaussians by label maps: the default pipeline of `segment`.
+    """Label Gaussians by label maps: the method ``uplift``.
 
     The votes of `uplift`, relabelled by how often the evidence confuses ids
-    (`correct_confusion`), and completed where no view sees anything (`complete`).
+    (`correct_confusion`). `complete` labels what no view sees, after any method.
 
     Args:
         gaussians: The Gaussians of the scene.
@@ -40,7 +36,6 @@ def lift_labels(
         options: How votes become labels.
         confusion: How the evidence errs. None takes the ids with most votes, and so do rules
             other than ``share``.
-        completion: How neighbours' labels spread. None leaves unseen Gaussians without.
         classes: Names of the ids, for the info.
         render_options: Switches of the blending model.
         backend: Name of the rendering backend.
@@ -72,8 +67,6 @@ def lift_labels(
         )
         if hard:
             labels = replace(labels, candidates=None, shares=None)
-    if completion is not None and bool((labels.ids != UNLABELLED).any()):
-        labels = complete(gaussians, labels, options=completion)
     return labels
 
 

@@ -33,7 +33,6 @@ def run(inputs: MethodInputs, options: UpliftMethodOptions) -> Labels:
         inputs.evidence,
         options=options.votes,
         confusion=confusion,
-        completion=None,
         classes=inputs.label_names,
         backend=inputs.backend,
         progress=inputs.progress,

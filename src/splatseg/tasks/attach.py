@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -19,18 +18,19 @@ from splatseg.core import (
     VoxelFeatures,
     with_info,
 )
-from splatseg.core.boundary import boundary, convert_fields
-from splatseg.errors import InputError, RangeError
+from splatseg.core.boundary import boundary
+from splatseg.core.options import Share
+from splatseg.core.options import options as options_class
+from splatseg.errors import InputError
 from splatseg.io.atomic import is_vacant
 from splatseg.io.export import check_parent, column_table_of, label_columns, write_labelled_splats
 from splatseg.io.scene import load_scene, save_scene, save_scene_layer, scene_layer_names
 from splatseg.io.scene_folder import is_scene, work_on_scene
 from splatseg.io.splats import Values, read_scene_splats
 from splatseg.lift import Attached, AttachOptions, attach
-from splatseg.tasks._observer import SILENT, Observer
+from splatseg.tasks.export_labels import label_tables
 from splatseg.tasks.import_scene import read_with_notes
-from splatseg.tasks.label_columns import label_tables
-from splatseg.tasks.scene_parts import layer_of, whole_layer
+from splatseg.tasks.work import SILENT, Observer, Work, versions
 
 _LABEL_COLUMNS = (
     "class_id", "confidence", "instance_id", "instance_confidence", "selected",
@@ -39,37 +39,32 @@ _LABEL_COLUMNS = (
 _NO_COLUMNS = (".spz", ".splat", ".ksplat", ".sog", ".glb", ".gltf")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@options_class
 class AttachLayersOptions:
-    """Which layers go along, and how much must be found."""
+    """Layers to attach, and how much must be found."""
 
     layers: tuple[str, ...] = ()
-    """For a scene folder: layers to take along. Empty takes all."""
+    """For a scene folder: layers to attach, separated by commas or spaces. Empty takes all."""
 
     layer: str | None = None
-    """For a PLY file: the layer whose ids become class_id; a selection becomes the column
-    selected."""
+    """For a .ply: the layer whose ids become class_id; a selection becomes the column selected."""
 
     instances: str | None = None
-    """For a PLY file: the layer whose ids become instance_id."""
+    """For a .ply: the layer whose ids become instance_id."""
 
-    min_found: float = 0.5
-    """Least share of the edited file's Gaussians that must be found, in [0, 1]; with fewer
-    nothing is written."""
+    min_found: Share = 0.5
+    """Smallest share of the edited file's Gaussians that must be found, in [0, 1]; below it nothing
+    is written."""
 
     strict: bool = False
     """Refuse files with Gaussians that cannot be rendered; see `read_splats`."""
 
     linear: tuple[Values, ...] = ()
-    """Which of scales and opacities PLY files have as they are, where 3DGS has logs and logits."""
+    """Values of PLY files that are stored as they are, where 3DGS stores logs and logits: scales,
+    opacities."""
 
     overwrite: bool = False
     """Replace layers of the same name in a scene folder that the edited file is."""
-
-    def __post_init__(self) -> None:
-        convert_fields(self)
-        if not 0 <= self.min_found <= 1:
-            raise RangeError(f"min_found: expected 0 to 1, got {self.min_found}.")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -92,7 +87,7 @@ class AttachedLayers:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Work:
+class _Attaching:
     """What is read, and how."""
 
     source: Path
@@ -129,7 +124,7 @@ def attach_layers(
     """
     options = options or AttachLayersOptions()
     _check(source, file, output, options)
-    work = _Work(
+    work = _Attaching(
         source=source, file=file, options=options, search=attach_options, observer=observer
     )
     if output is None:
@@ -178,7 +173,7 @@ def _check_output(output: Path, read: set[Path]) -> None:
         raise InputError(f"{output}: is what is read; choose another name.")
 
 
-def _columns_to_file(work: _Work, output: Path) -> AttachedLayers:
+def _columns_to_file(work: _Attaching, output: Path) -> AttachedLayers:
     source = _read(work, work.source)
     named = [name for name in _LABEL_COLUMNS if name in source.extra]
     if not named:
@@ -193,11 +188,12 @@ def _columns_to_file(work: _Work, output: Path) -> AttachedLayers:
     return _write(work, output, _like(source, edited), found, columns=columns, table=table)
 
 
-def _layers_to_file(work: _Work, output: Path) -> AttachedLayers:
+def _layers_to_file(work: _Attaching, output: Path) -> AttachedLayers:
     options = work.options
     scene = load_scene(work.source)
-    classes = None if options.layer is None else layer_of(scene, options.layer)
-    instances = None if options.instances is None else layer_of(scene, options.instances)
+    opened = Work(scene=scene)
+    classes = None if options.layer is None else opened.flat_layer(options.layer)
+    instances = None if options.instances is None else opened.flat_layer(options.instances)
     if isinstance(classes, Features | VoxelFeatures) or not isinstance(instances, Labels | None):
         raise InputError("layer, instances: expected layers of labels.")
     if classes is None and instances is None:
@@ -217,7 +213,7 @@ def _layers_to_file(work: _Work, output: Path) -> AttachedLayers:
 
 
 def _write(
-    work: _Work,
+    work: _Attaching,
     output: Path,
     edited: Gaussians,
     found: Attached,
@@ -235,7 +231,7 @@ def _write(
     )
 
 
-def _layers_to_new_scene(work: _Work, output: Path) -> AttachedLayers:
+def _layers_to_new_scene(work: _Attaching, output: Path) -> AttachedLayers:
     scene = load_scene(work.source)
     layers = _layers(work, scene)
     edited = _edited(work)
@@ -252,7 +248,7 @@ def _layers_to_new_scene(work: _Work, output: Path) -> AttachedLayers:
             "command": "attach",
             "source": work.source.name,
             "attached": _facts(work, found),
-            "versions": {name: metadata.version(name) for name in ("splatseg", "torch")},
+            "versions": versions("splatseg", "torch"),
         },
     )
     carried = {name: _carried(work, found, layer) for name, layer in layers.items()}
@@ -262,7 +258,7 @@ def _layers_to_new_scene(work: _Work, output: Path) -> AttachedLayers:
     )
 
 
-def _layers_to_scene(work: _Work) -> AttachedLayers:
+def _layers_to_scene(work: _Attaching) -> AttachedLayers:
     scene = load_scene(work.source)
     layers = _layers(work, scene)
     clash = sorted(set(layers) & set(scene_layer_names(work.file)))
@@ -280,19 +276,20 @@ def _layers_to_scene(work: _Work) -> AttachedLayers:
     )
 
 
-def _layers(work: _Work, scene: Scene) -> dict[str, Layer]:
+def _layers(work: _Attaching, scene: Scene) -> dict[str, Layer]:
     names = work.options.layers or scene_layer_names(work.source)
     if not names:
         raise InputError(f"{work.source}: expected a scene with layers to attach, it has none.")
-    return {name: whole_layer(scene, name) for name in names}
+    opened = Work(scene=scene)
+    return {name: opened.layer(name) for name in names}
 
 
-def _read(work: _Work, path: Path) -> Gaussians:
+def _read(work: _Attaching, path: Path) -> Gaussians:
     options = work.options
     return read_with_notes(path, work.observer, strict=options.strict, linear=options.linear)
 
 
-def _edited(work: _Work) -> Gaussians:
+def _edited(work: _Attaching) -> Gaussians:
     path = work.file / "gaussians.ply" if is_scene(work.file) else work.file
     edited = read_scene_splats(path) if is_scene(work.file) else _read(work, path)
     if not len(edited):
@@ -300,7 +297,7 @@ def _edited(work: _Work) -> Gaussians:
     return edited
 
 
-def _attached(work: _Work, source: Gaussians, edited: Gaussians) -> Attached:
+def _attached(work: _Attaching, source: Gaussians, edited: Gaussians) -> Attached:
     found = attach(source, edited, options=work.search)
     facts = found.report
     if found.share < work.options.min_found:
@@ -329,11 +326,11 @@ def _sentence(move: Mapping[str, Any]) -> str:
     )
 
 
-def _facts(work: _Work, found: Attached) -> dict[str, Any]:
+def _facts(work: _Attaching, found: Attached) -> dict[str, Any]:
     return {"file": work.file.name, "source": work.source.name, **found.report}
 
 
-def _carried(work: _Work, found: Attached, layer: Layer) -> Layer:
+def _carried(work: _Attaching, found: Attached, layer: Layer) -> Layer:
     carried = found.carry(layer)
     return with_info(carried, carried.info.with_edit("attach", _facts(work, found)))
 

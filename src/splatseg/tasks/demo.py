@@ -7,11 +7,14 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from msgspec import Meta
 
 from splatseg.core import Scene
-from splatseg.core.boundary import boundary, convert_fields
-from splatseg.errors import InputError, RangeError
+from splatseg.core.boundary import boundary
+from splatseg.core.options import options as options_class
+from splatseg.errors import InputError
 from splatseg.fit import FitOptions
 from splatseg.io.atomic import is_vacant
 from splatseg.io.json_files import read_json, write_json
@@ -21,17 +24,14 @@ from splatseg.render import BackendName
 from splatseg.report.demo_report import DemoFigures, machine_score, write_report
 from splatseg.report.fit_report import scored_of
 from splatseg.synthetic import cameras, room, write_capture
-from splatseg.tasks._observer import SILENT, Observer
 from splatseg.tasks.evaluate import EvaluationOptions, Metric, evaluate_scene
-from splatseg.tasks.export import export_scene
-from splatseg.tasks.export_options import ExportOptions
+from splatseg.tasks.export import export_layer, export_scene, report_layer
+from splatseg.tasks.export_labels import ExportOptions
 from splatseg.tasks.make_scene import MadeScene, fit_capture
-from splatseg.tasks.new_scene import check_parent
-from splatseg.tasks.outputs import export_layer, report_layer
 from splatseg.tasks.render import RenderingOptions, render_views
 from splatseg.tasks.see import see
-from splatseg.tasks.segment import Segmentation, segment
-from splatseg.tasks.segment_options import SegmentOptions
+from splatseg.tasks.segment import Segmentation, SegmentOptions, segment
+from splatseg.tasks.work import SILENT, Observer, check_parent
 
 _RECORD = "demo.json"
 _MADE_BY = "splatseg demo"
@@ -45,34 +45,27 @@ _OBJECTS = "objects"
 _MASKS = "masks"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@options_class
 class DemoOptions:
-    """Which room, how many photographs of it, and how long it is fitted."""
+    """Room, number of photographs, and length of the fit."""
 
     minutes: float | None = None
-    """Length of the fit. None is 1.5, unless `steps` says how long."""
+    """Length of the fit, minutes. None takes 1.5, unless `steps` is given."""
 
     steps: int | None = None
     """Length of the fit in steps instead: same seed, same result."""
 
     max_gaussians: int = 60_000
-    """Most Gaussians of the scene."""
+    """Largest number of Gaussians of the scene."""
 
-    train_views: int = 48
-    """Photographs to learn from; a quarter as many are held out."""
+    train_views: Annotated[int, Meta(ge=4)] = 48
+    """Number of training photographs; a quarter as many are held out."""
 
-    width: int = 320
-    """Pixels a row of the photographs; they are three quarters as high."""
+    width: Annotated[int, Meta(ge=32)] = 320
+    """Width of the photographs, pixels; they are three quarters as high."""
 
     seed: int = 0
-    """Which room, and every other choice."""
-
-    def __post_init__(self) -> None:
-        convert_fields(self)
-        if self.train_views < 4:
-            raise RangeError(f"train_views: expected at least 4, got {self.train_views}.")
-        if self.width < 32:
-            raise RangeError(f"width: expected at least 32 pixels, got {self.width}.")
+    """Seed of the room and of all other random choices."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -98,7 +91,7 @@ def make_demo(
     Args:
         folder: Where everything goes. One that an earlier demo made is replaced.
         options: Which room.
-        backend: Who renders.
+        backend: Rendering backend.
         observer: Is told of each step by the command that does the same.
 
     Raises:

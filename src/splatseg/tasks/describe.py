@@ -42,8 +42,7 @@ from splatseg.io.scene_folder import (
     training_files,
 )
 from splatseg.io.splats import SplatWarning, Values, read_splats, splat_format, trained_splats
-from splatseg.tasks.stopped_fit import where_it_stopped
-from splatseg.tasks.stopped_training import where_training_stopped
+from splatseg.tasks.checkpoints import where_it_stopped, where_training_stopped
 
 _LAYOUTS = ("auto", *FORMATS)
 _CAPTURE_FILES = (

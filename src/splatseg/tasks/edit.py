@@ -1,11 +1,16 @@
-"""A new scene with things taken out, moved, copied, coloured or joined."""
+"""A new scene with things taken out, moved, copied, coloured or joined, and pictures of it."""
 
+import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
+import torch
+from torch import Tensor
+
+from splatseg.core import Scene, View
 from splatseg.core.boundary import boundary
 from splatseg.edit import (
     Document,
@@ -18,16 +23,142 @@ from splatseg.edit import (
 )
 from splatseg.edit.document import BASE, HISTORY
 from splatseg.errors import InputError, MissingFileError
+from splatseg.io.images import reduced_size, save_png
 from splatseg.io.scene_folder import is_scene
 from splatseg.lift import CutOptions
-from splatseg.render import BackendName
-from splatseg.tasks._edit_cut import Cut, measured_change
-from splatseg.tasks._edit_operations import operations_of, where_of
-from splatseg.tasks._edit_pictures import draw_edit, write_edit_report
-from splatseg.tasks._observer import SILENT, Observer
-from splatseg.tasks.edit_options import EditOptions
-from splatseg.tasks.new_scene import check_new_folder
-from splatseg.tasks.outputs import REPORTS_FOLDER
+from splatseg.render import BackendName, render
+from splatseg.report.html import Figure, Report
+from splatseg.report.images import Gallery, GalleryImage, contact_sheet
+from splatseg.tasks.edit_operations import (
+    Cut,
+    EditOptions,
+    measured_change,
+    operations_of,
+    where_of,
+)
+from splatseg.tasks.work import REPORTS_FOLDER, SILENT, Observer, Work, check_new_folder, write_page
+
+_ASKED_VIEWS = 24
+"""Views that are looked at, small, to find those that change most."""
+
+
+_SMALL, _LARGE = 160, 960
+"""Longest side in pixels of these and of those that are shown."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class EditPictures:
+    """Views that change most, the first most of all; pictures are 8-bit sRGB."""
+
+    gallery: Gallery
+    views: tuple[str, ...]
+
+
+def draw_edit(
+    before: Scene, after: Scene, *, views: int, backend: BackendName
+) -> EditPictures | None:
+    """Draw the views that an edit changes most, before and after it.
+
+    Views are compared by name, each with the camera that it has in its scene: a scene that was
+    moved as a whole shows the same.
+
+    Returns:
+        None where no view is wanted, or the scenes share none.
+    """
+    names = {view.name for view in after.views}
+    shared = [view for view in before.train_views or before.views if view.name in names]
+    if not views or not shared:
+        return None
+    asked = shared[:: math.ceil(len(shared) / _ASKED_VIEWS)]
+    changes: list[float] = []
+    for view in asked:
+        first, second = (_small_image(s, view.name, _SMALL, backend) for s in (before, after))
+        changes.append(float(((first - second) ** 2).mean()))
+    order = sorted(range(len(asked)), key=lambda i: (-changes[i], i))[:views]
+    chosen = [asked[i] for i in order]
+    return EditPictures(
+        gallery=Gallery(
+            title="Before and after",
+            columns=("before", "after"),
+            rows=tuple(_row(before, after, view, backend) for view in chosen),
+            note="The views that change most, the first most of all.",
+        ),
+        views=tuple(view.name for view in chosen),
+    )
+
+
+def _row(
+    before: Scene, after: Scene, view: View, backend: BackendName
+) -> tuple[str, tuple[GalleryImage, ...]]:
+    pictures = (
+        GalleryImage(
+            image=(_small_image(scene, view.name, _LARGE, backend) * 255 + 0.5).to(torch.uint8),
+            caption=f"{view.name}, {when}",
+        )
+        for scene, when in ((before, "before"), (after, "after"))
+    )
+    return view.name, tuple(pictures)
+
+
+def _small_image(scene: Scene, name: str, longest: int, backend: BackendName) -> Tensor:
+    camera = scene.view(name).camera
+    size = reduced_size(camera.width, camera.height, longest)
+    if size != (camera.width, camera.height):
+        camera = camera.resized(*size)
+    return render(scene.gaussians, camera, backend=backend).image.clamp(0, 1).cpu()
+
+
+def write_edit_report(
+    pictures: EditPictures,
+    folder: Path,
+    *,
+    counts: tuple[int, int],
+    operations: Sequence[Mapping[str, Any]],
+) -> None:
+    """Write edit.html, edit.png and edit.json in a folder of reports.
+
+    Args:
+        folder: The reports of the new scene; made where it is not there.
+        pictures: What is shown.
+        counts: Gaussians before and after.
+        operations: What was done, one entry a step.
+    """
+    folder.mkdir(exist_ok=True)
+    before, after = counts
+    sentences = [edit_sentence(operation) for operation in operations]
+    figures = (
+        Figure(value=f"{before}", label="Gaussians before"),
+        Figure(value=f"{after}", label="Gaussians after", note=f"{after - before:+}"),
+    )
+    page = Report(
+        title="Edit",
+        summary=" ".join(sentences),
+        figures=figures,
+        blocks=(pictures.gallery,),
+    )
+    save_png(contact_sheet(pictures.gallery, cell_width=480), folder / "edit.png")
+    record = {
+        "before": before,
+        "after": after,
+        "operations": [dict(operation) for operation in operations],
+        "views": list(pictures.views),
+    }
+    write_page(page, folder / "edit.html", record)
+
+
+def edit_sentence(operation: Mapping[str, Any]) -> str:
+    """What one step did, in words."""
+    kind, selected = operation["kind"], operation.get("selected")
+    if kind == "undo":
+        return f"The last edit ({operation['undone']}) was undone."
+    text = f"{kind}: " + ("everything" if selected is None else f"{selected} Gaussians selected")
+    if operation.get("specks"):
+        text += f", {operation['specks']} of them specks that it would have left behind"
+    if operation.get("split"):
+        text += (
+            f"; {operation['split']} split at the boundary first, which adds {operation['added']}"
+        )
+    return text + "."
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -65,7 +196,7 @@ def edit_scene(
         options: What is done.
         cut_options: How Gaussians are split at the boundary of what is selected.
         data: Folder of the capture where it was moved, for the scene that undo begins with.
-        backend: Who renders.
+        backend: Rendering backend.
         observer: Is told of the progress and of what was done.
 
     Raises:
@@ -73,7 +204,7 @@ def edit_scene(
         MissingFileError: If another scene that is needed is not there.
     """
     check_new_folder(folder)
-    root = _root(document)
+    root = Work(scene=document.scene).root
     if options.undo:
         after, done = _undone(root, document, data, backend, observer)
     else:
@@ -104,12 +235,6 @@ class _Work:
     cut: Cut
     backend: BackendName
     observer: Observer
-
-
-def _root(document: Document) -> Path:
-    if document.scene.root is None:
-        raise InputError("document: expected a scene read from its folder, got one without.")
-    return document.scene.root
 
 
 def _edited(work: _Work, document: Document) -> tuple[Document, list[Mapping[str, Any]]]:

@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from splatseg.core import ClassTable, Layer, Renderable, Scene, View
-from splatseg.core.boundary import boundary, convert_fields
+from splatseg.core.boundary import boundary
+from splatseg.core.options import options as options_class
 from splatseg.errors import InputError
 from splatseg.evaluate import (
     SemanticReport,
@@ -20,21 +21,16 @@ from splatseg.evaluate import (
 )
 from splatseg.evaluate.photographs import Lpips, load_lpips
 from splatseg.io.evidence import Evidence, check_map_sizes, open_evidence
-from splatseg.io.json_files import read_json
-from splatseg.io.tables import class_table
-from splatseg.lift import PointLabelOptions, PointRule
 from splatseg.render import BackendName
-from splatseg.tasks._figures import (
+from splatseg.tasks.figures import (
     binary_figures,
     instance_figures,
     panoptic_figures,
     point_figures,
     read_points,
-    read_scores,
     semantic_figures,
 )
-from splatseg.tasks._observer import SILENT, Observer
-from splatseg.tasks.scene_parts import gaussian_field, mask_use, views_of_split
+from splatseg.tasks.work import SILENT, Observer, Work, mask_use, photographed
 
 Metric = Literal["semantic", "instances", "panoptic", "binary"]
 
@@ -45,16 +41,24 @@ _INSTANCE_FOLDERS = ("instance", "instances")
 _POINT_TRUTH: Mapping[str, str] = {"semantic": "semantic", "instances": "instance"}
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@options_class(
+    removed={
+        "metadata": "`classes` takes the same JSON file",
+        "scores": "AP50 ranks all instances alike; `evaluate.evaluate_panoptic` takes scores",
+        "points_rule": "the density of the Gaussians around a point decides; "
+        "`lift.PointLabelOptions` has the nearest",
+        "photographs": "renders are scored where photographs are at hand",
+    }
+)
 class EvaluationOptions:
-    """What is scored against what."""
+    """What is scored, and the truth."""
 
     layer: str | None = None
-    """Name of the layer to score. NAME@part is a cut of a tree; NAME@hard reads features Gaussian
-    by Gaussian and not view by view. None scores renders only."""
+    """Name of the layer to score. NAME@part is a cut of a tree; NAME@hard reads features of each
+    Gaussian instead of each pixel. None scores renders only."""
 
     truth: Path | None = None
-    """Folder of the true id maps, one PNG a view; 0 is void. Of classes, or of instances where
+    """Folder of true id maps, one PNG per view; 0 is void. Of classes, or of instances where
     `metric` is instances."""
 
     instances: str | None = None
@@ -62,60 +66,41 @@ class EvaluationOptions:
     `layer` for both: its record must tell each instance's class, as that of associate does."""
 
     truth_instances: Path | None = None
-    """With panoptic: folder of the true instance maps; `truth` is that of the classes."""
-
-    metadata: Path | None = None
-    """With panoptic: JSON whose "classes" say which are things (id, name, isthing). None takes
-    the metadata.json beside the truth, else the classes of the scene."""
-
-    scores: Path | None = None
-    """With panoptic: JSON object of a score by instance id, by which AP50 ranks. None ranks all
-    alike."""
+    """With panoptic: folder of true instance maps; `truth` is that of the classes."""
 
     points: Path | None = None
-    """Also score labels of points: an .npz with xyz (n x 3, world) and, as the metric asks,
-    semantic or instance (n, 0 is void)."""
-
-    points_rule: PointRule = "weighted"
-    """How a point takes its label: weighted, by the density there of the Gaussians around it;
-    nearest, that of the nearest centre."""
+    """Also score labels of points: an .npz with xyz (n x 3, world) and, for the metric, semantic or
+    instance (n, 0 is void)."""
 
     zero_is_class: bool = False
-    """The id 0 of the truth's files is a class and not void: ids grow by 1."""
+    """The id 0 of the truth's files is a class, not void: ids grow by 1."""
 
     void: int | None = None
     """A further id of the truth's files that means void, such as 255."""
 
     suffix: str = ""
-    """What stands in the names of the truth's files between the view and the ending, such as
-    _gt for 000_gt.png; files without it are left aside."""
+    """Text between the view's name and the ending in names of the truth's files, such as _gt for
+    000_gt.png; files without it are skipped."""
 
     classes: str | None = None
-    """Names of the truth's ids: ade20k, coco, cityscapes, scannet, kitti360 or semantic-kitti,
-    with -train behind it for the ids that networks learn; or a JSON file with "classes". Pictures
-    in a table's colours are read by it. None takes what the truth, the layer or the scene
-    tells."""
+    """Names of the truth's ids: ade20k, coco, cityscapes, scannet, kitti360 or semantic-kitti, with
+    the suffix -train for the ids that networks predict; or a JSON file with "classes" (id, name,
+    isthing). Pictures in a table's colours are read by it. None takes what the truth, the layer or
+    the scene says."""
 
     split: str = "test"
-    """Which views: test, train, another split of the scene, or all."""
+    """Views: test, train, another split of the scene, or all."""
 
     metric: Metric = "semantic"
-    """What to score: semantic, classes; instances, objects whatever their ids; panoptic, both
-    together; binary, one id or a selection as a mask."""
+    """What to score: semantic, classes; instances, objects by their overlap; panoptic, both;
+    binary, one id or a selection as a mask."""
 
     id: int | None = None
     """With binary: the id to score. None takes every labelled pixel."""
 
-    photographs: bool = False
-    """Insist on scoring renders (PSNR, SSIM). Without it they are scored where the
-    photographs are at hand."""
-
     lpips: tuple[Path, ...] = ()
     """Also score LPIPS with your weights: AlexNet's or VGG-16's, and the heads', as .safetensors
     or .npz with the names of torchvision and of the lpips package."""
-
-    def __post_init__(self) -> None:
-        convert_fields(self)
 
 
 @boundary
@@ -140,7 +125,7 @@ def evaluate_scene(
         options: What to score.
         layers: Layers at hand; others are read from the scene's folder.
         field: What is scored, with layers of its own; None is the scene's Gaussians with theirs.
-        backend: Who renders the Gaussians.
+        backend: Rendering backend of the Gaussians.
         observer: Is told of the progress.
 
     Returns:
@@ -151,26 +136,16 @@ def evaluate_scene(
     """
     options = options or EvaluationOptions()
     _check(options)
-    rule = None if field is not None else options.points_rule
+    work = Work(scene=scene, layers=layers, backend=backend, observer=observer)
     if field is None:
-        field = gaussian_field(
-            scene,
-            [name for name in (options.layer, options.instances) if name is not None],
-            layers,
-            backend=backend,
-            points=PointLabelOptions(rule=options.points_rule),
-        )
-    elif options.points_rule != EvaluationOptions().points_rule:
-        raise InputError(
-            "points_rule: goes with the scene's Gaussians; a field that is given has its own rule."
-        )
-    job = _Job(scene=scene, field=field, rule=rule, options=options, observer=observer)
+        field = work.field(name for name in (options.layer, options.instances) if name is not None)
+    job = _Job(scene=scene, field=field, options=options, observer=observer)
     network = load_lpips(options.lpips) if options.lpips else None
     figures: dict[str, Any] = {"scene": str(scene.root), "split": options.split}
     if options.layer is not None:
         figures |= {"layer": options.layer, "metric": options.metric}
     if options.truth is not None or options.layer is None:
-        views = views_of_split(scene, options.split)
+        views = work.views_of_split(options.split)
         figures |= _in_views(job, views, network)
     if options.points is not None:
         figures |= _point_figures(job, options.points)
@@ -181,9 +156,6 @@ def evaluate_scene(
 class _Job:
     scene: Scene
     field: Renderable
-    rule: PointRule | None
-    """How points take labels, where that is for us to say."""
-
     options: EvaluationOptions
     observer: Observer
 
@@ -196,21 +168,14 @@ def _check(options: EvaluationOptions) -> None:
         )
     if options.layer is not None and not (options.truth or options.points):
         raise InputError("truth: expected a folder of true id maps (or points), got none.")
-    panoptic = (
-        options.instances,
-        options.truth_instances,
-        options.metadata,
-        options.scores,
-    )
     if options.metric == "panoptic" and options.truth_instances is None:
         raise InputError(
             "truth_instances: expected the folder of true instance maps beside the truth, which "
             "is of classes, got none."
         )
-    if options.metric != "panoptic" and any(panoptic):
+    if options.metric != "panoptic" and (options.instances or options.truth_instances):
         raise InputError(
-            "instances, truth_instances, metadata, scores: expected metric panoptic with them, "
-            f"got {options.metric}."
+            f"instances, truth_instances: expected metric panoptic with them, got {options.metric}."
         )
     if options.points is not None and options.metric not in _POINT_TRUTH:
         raise InputError(
@@ -231,7 +196,7 @@ def _in_views(job: _Job, views: tuple[View, ...], network: Lpips | None) -> dict
         )
         check_map_sizes(truth, views)
         figures |= _layer_figures(job, views, job.options.layer, truth)
-    if network is not None or _wants_photographs(job, views):
+    if network is not None or len(photographed(views)) == len(views):
         figures |= _photograph_figures(job, views, network)
     elif job.options.layer is None:
         raise InputError(
@@ -326,27 +291,17 @@ def _panoptic_figures(
             true_classes=truth,
             true_instances=true_instances,
             table=_thing_table(job, truth),
-            scores=None if job.options.scores is None else read_scores(job.options.scores),
             progress=step,
         )
     return panoptic_figures(report)
 
 
 def _thing_table(job: _Job, truth: Evidence) -> ClassTable:
-    if job.options.metadata is not None:
-        if job.options.zero_is_class:
-            raise InputError(
-                "metadata: its ids are those of the files, which zero_is_class changes; "
-                "put it beside the truth as metadata.json instead."
-            )
-        return class_table(
-            read_json(job.options.metadata).get("classes"), where=str(job.options.metadata)
-        )
     table = truth.classes or job.scene.classes
     if table is None:
         raise InputError(
-            "metadata: expected a JSON file that says which classes are things; neither the "
-            "truth nor the scene does."
+            "classes: expected a JSON file that says which classes are things; neither the truth "
+            "nor the scene does."
         )
     return table
 
@@ -363,17 +318,12 @@ def _point_figures(job: _Job, path: Path) -> dict[str, Any]:
         truth=truth,
         matched=job.options.metric == "instances",
     )
-    return point_figures(report, rule=job.rule)
+    return point_figures(report)
 
 
 def _check_labels(job: _Job, name: str, option: str) -> None:
     if job.field.layer(name).kind != "labels":
         raise InputError(f"{option}: expected a layer of labels, {name} is none.")
-
-
-def _wants_photographs(job: _Job, views: tuple[View, ...]) -> bool:
-    at_hand = all(view.image is not None and view.image.is_file() for view in views)
-    return job.options.photographs or at_hand
 
 
 def _photograph_figures(

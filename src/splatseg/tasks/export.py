@@ -1,14 +1,18 @@
-"""A scene and its labels as files of other programs."""
+"""A scene and its labels as files of other programs, and what goes with a layer of labels."""
 
+import resource
+import sys
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from splatseg.core import Gaussians, Layer, Scene
+from splatseg.core import TREE_LEVELS, Features, InstanceTree, Layer, Scene
 from splatseg.core.boundary import boundary
-from splatseg.errors import InputError, RangeError
+from splatseg.errors import InputError
+from splatseg.io.atomic import named_write_failures
+from splatseg.io.evidence import Evidence
 from splatseg.io.export import (
     check_beside,
     check_parent,
@@ -16,28 +20,28 @@ from splatseg.io.export import (
     write_coco_panoptic,
     write_column_table,
     write_labelled_splats,
+    write_node_table,
     write_object_splats,
     write_object_table,
     write_points,
 )
+from splatseg.io.scene_folder import scene_path
 from splatseg.io.splats import SplatWarning
 from splatseg.lift import GaussianField
 from splatseg.render import BackendName
+from splatseg.report.segment_report import SegmentationRun, write_segmentation_report
 from splatseg.report.words import counted
-from splatseg.tasks._export_job import (
+from splatseg.tasks.export_labels import (
     ExportJob,
-    class_names,
-    columns_of,
-    meaning_of,
+    ExportOptions,
+    What,
     open_job,
-    rows_of,
-    with_only,
+    panoptic_frames,
+    panoptic_segments,
 )
-from splatseg.tasks._film import path_views
-from splatseg.tasks._observer import SILENT, Observer
-from splatseg.tasks._panoptic_frames import panoptic_frames, panoptic_segments
-from splatseg.tasks.export_options import ExportOptions, What
-from splatseg.tasks.scene_parts import views_of_split
+from splatseg.tasks.render import Rendering, RenderingOptions, render_views
+from splatseg.tasks.segment import Segmentation
+from splatseg.tasks.work import EXPORTS_FOLDER, REPORTS_FOLDER, SILENT, Observer, Work
 
 _NOTES = 3
 
@@ -80,7 +84,7 @@ def export_scene(
         options: Which layers, and how.
         layers: Layers at hand; others are read from the scene's folder.
         files: With table: where each object's splats are, by id; it is said in the table.
-        backend: Who renders.
+        backend: Rendering backend.
         observer: Is told of the progress, and of what a format cannot hold.
 
     Raises:
@@ -89,18 +93,8 @@ def export_scene(
     """
     options = options or ExportOptions()
     _check(scene, output, what, options)
-    job = with_only(
-        open_job(
-            scene,
-            output,
-            what,
-            options,
-            layers,
-            files=files or {},
-            backend=backend,
-            observer=observer,
-        )
-    )
+    work = Work(scene=scene, layers=layers, backend=backend, observer=observer)
+    job = open_job(work, output, what, options, files=files or {})
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", SplatWarning)
         done = _WRITERS[what](job)
@@ -111,21 +105,8 @@ def export_scene(
     return done
 
 
-def check_export(scene: Scene, output: Path, what: What) -> None:
-    """Refuse, before long work, a place that `export_scene` could not write to after it.
-
-    Raises:
-        InputError: If something else is there, or there is no folder to write in.
-    """
-    _check_place(scene, output, what)
-
-
 def _check(scene: Scene, output: Path, what: What, options: ExportOptions) -> None:
     """Refuse options that contradict each other, and places that cannot be written to."""
-    for name in ("min_confidence", "min_opacity"):
-        value = getattr(options, name)
-        if not 0 <= value <= 1:
-            raise RangeError(f"{name}: expected 0 to 1, got {value}.")
     for name, given, kinds in (
         ("splat_format", options.splat_format is not None, ("splat", "objects")),
         ("unlabelled", options.unlabelled, ("objects",)),
@@ -149,28 +130,27 @@ def _check_place(scene: Scene, output: Path, what: What) -> None:
 
 
 def _splat(job: ExportJob) -> Exported:
-    columns = columns_of(job)
-    count = len(job.scene.gaussians)
-    table = {"gaussians": count, "columns": meaning_of(job)} if columns else None
+    columns, meaning = job.columns()
+    count = len(job.gaussians)
     beside = write_labelled_splats(
-        job.scene.gaussians,
+        job.gaussians,
         job.output,
         columns=columns,
-        table=table,
+        table={"gaussians": count, "columns": meaning} if columns else None,
         format=job.options.splat_format,
     )
     return Exported(output=job.output, summary=f"{count} Gaussians", table=beside)
 
 
 def _folder_of_objects(job: ExportJob) -> Exported:
-    rows = rows_of(job)
+    rows = job.rows()
     files = write_object_splats(
-        job.scene.gaussians,
+        job.gaussians,
         job.objects,
         job.output,
         rows=rows,
         format=job.options.splat_format or "ply",
-        columns=columns_of(job),
+        columns=job.columns()[0],
         about=job.about,
         unlabelled=job.options.unlabelled,
     )
@@ -182,53 +162,34 @@ def _folder_of_objects(job: ExportJob) -> Exported:
 
 
 def _points(job: ExportJob) -> Exported:
-    gaussians, columns = job.scene.gaussians, columns_of(job)
-    solid = gaussians.opacities >= job.options.min_opacity
-    gaussians = _bare(gaussians[solid])
+    columns, meaning = job.columns()
+    solid = job.gaussians.opacities >= job.options.min_opacity
+    gaussians = job.gaussians[solid]
+    gaussians = gaussians.replace(extra={}, sh=gaussians.sh[:, :1])
     columns = {name: column[solid] for name, column in columns.items()}
     beside = check_beside(job.output) if columns else None
     classified = write_points(gaussians, job.output, columns=columns)
     if beside is not None:
-        content: dict[str, Any] = {"gaussians": len(gaussians), "columns": meaning_of(job)}
+        content: dict[str, Any] = {"gaussians": len(gaussians), "columns": meaning}
         if classified:
             content["las_classification"] = {str(id): value for id, value in classified.items()}
         write_column_table(content, beside)
     return Exported(output=job.output, summary=f"{len(gaussians)} points", table=beside)
 
 
-def _bare(gaussians: Gaussians) -> Gaussians:
-    return gaussians.replace(extra={}, sh=gaussians.sh[:, :1])
-
-
 def _table(job: ExportJob) -> Exported:
-    rows = rows_of(job)
+    rows = job.rows()
     write_object_table(rows, job.output, about=job.about, files=job.files)
     return Exported(output=job.output, summary=counted(len(rows), "object"))
 
 
 def _coco(job: ExportJob) -> Exported:
-    options, scene = job.options, job.scene
-    on_path = options.split == "path" and all(view.split != "path" for view in scene.views)
-    if on_path:
-        field = GaussianField(scene.gaussians, backend=job.backend)
-        views = path_views(scene, field, frames=options.frames)
-    else:
-        views = views_of_split(scene, options.split)
-    things = job.objects
-    stuff = job.classes if job.instances is not None else None
-    names = class_names(scene, job.classes)
-    segments = panoptic_segments(
-        scene,
-        things,
-        stuff,
-        names=names,
-        class_of=things.info.class_of,
-        are_classes=job.instances is None,
-    )
-    with job.observer.stage("export") as step:
-        frames = panoptic_frames(scene, views, segments, backend=job.backend, progress=step)
+    options, work = job.options, job.work
+    views, _ = work.split_or_path(options.split, frames=options.frames)
+    segments = panoptic_segments(job)
+    with work.observer.stage("export") as step:
         count = write_coco_panoptic(
-            frames,
+            panoptic_frames(work, views, segments, progress=step),
             job.output,
             segments=segments.infos,
             categories=segments.categories,
@@ -244,3 +205,150 @@ _WRITERS: dict[What, Callable[[ExportJob], Exported]] = {
     "coco": _coco,
     "table": _table,
 }
+
+
+_FILES: tuple[tuple[What, str], ...] = (
+    ("objects", "objects"),
+    ("table", "objects.csv"),
+    ("splat", "labelled.ply"),
+)
+_LABEL_MAPS = "label_maps"
+_NODES = "nodes.csv"
+
+
+@boundary
+def check_layer_exports(scene: Scene, root: Path, layer: str) -> None:
+    """Refuse, before the work, a folder that `export_layer` could not write to.
+
+    Raises:
+        InputError: If something else is in the way.
+    """
+    for folder in (root / EXPORTS_FOLDER, root / EXPORTS_FOLDER / layer):
+        if folder.exists() and not folder.is_dir():
+            raise InputError(f"{folder}: expected a folder for exports, got a file.")
+    if (root / EXPORTS_FOLDER / layer).is_dir():
+        for what, name in _FILES:
+            _check_place(scene, root / EXPORTS_FOLDER / layer / name, what)
+
+
+@boundary
+def export_layer(
+    scene: Scene,
+    root: Path,
+    name: str,
+    layer: Layer,
+    *,
+    backend: BackendName = "auto",
+    observer: Observer = SILENT,
+) -> tuple[tuple[Exported, ...], Rendering | None]:
+    """Write ROOT/exports/NAME: everything that a layer of labels is good for elsewhere.
+
+    Objects as splat files, a table of them that names the files, all Gaussians with their labels
+    as columns, and label maps of all views. Of a tree these are
+    its objects; with it come the table of all nodes, and label maps of its groups and parts. Of
+    features with a classifier, files have the labels of Gaussians (the hard readout), and label
+    maps are rendered ones.
+
+    Raises:
+        InputError: If the layer is of features without a classifier.
+    """
+    field = GaussianField(scene.gaussians, {name: layer}, backend=backend)
+    of_files: Layer = field.labels(name) if isinstance(layer, Features) else layer
+    folder = scene_path(root, EXPORTS_FOLDER, name)
+    with named_write_failures(folder):
+        folder.mkdir(exist_ok=True)
+    files: list[Exported] = []
+    names: dict[int, str] = {}
+    for what, file in _FILES:
+        made = export_scene(
+            scene,
+            folder / file,
+            what,
+            options=ExportOptions(layer=name),
+            layers={name: of_files},
+            files=names,
+            backend=backend,
+            observer=observer,
+        )
+        files.append(made)
+        names |= {id: f"{file}/{stem}" for id, stem in made.files.items()}
+    if isinstance(layer, InstanceTree):
+        write_node_table(layer, folder / _NODES)
+        said = f"{len(layer.nodes)} groups, objects and parts"
+        files.append(Exported(output=folder / _NODES, summary=said))
+    if not scene.views:
+        return tuple(files), None
+    maps = render_views(
+        scene,
+        folder / _LABEL_MAPS,
+        options=RenderingOptions(split="all", what=_drawn(name, layer), coloured=True),
+        field=field,
+        observer=observer,
+    )
+    return tuple(files), maps
+
+
+def _drawn(name: str, layer: Layer) -> tuple[str, ...]:
+    """What label maps are drawn of: the layer, and the other levels of a tree."""
+    if not isinstance(layer, InstanceTree):
+        return (name,)
+    return (name, *(f"{name}@{level}" for level in TREE_LEVELS if level != "object"))
+
+
+@boundary
+def report_layer(
+    scene: Scene,
+    root: Path,
+    result: Segmentation,
+    *,
+    truth: Evidence | None = None,
+    timings: Mapping[str, float] | None = None,
+    exported: Sequence[Exported] = (),
+    command: str = "",
+    backend: BackendName = "auto",
+) -> Path:
+    """Write ROOT/reports/NAME.html, and NAME.json beside it; gives the path of the page.
+
+    Args:
+        scene: The scene.
+        root: Its folder.
+        result: The layer, and what it was made from.
+        truth: True maps, shown and scored.
+        timings: Seconds by stage, besides those of the result.
+        exported: What `export_layer` wrote of it; objects are told with their files.
+        command: The words that started it; may be empty.
+        backend: Rendering backend.
+    """
+    path = scene_path(root, REPORTS_FOLDER, f"{result.name}.html")
+    # Linux counts in KiB, macOS in bytes.
+    unit = 1 if sys.platform == "darwin" else 1024
+    field = GaussianField(scene.gaussians, {result.name: result.layer}, backend=backend)
+    write_segmentation_report(
+        scene,
+        path,
+        field=field,
+        labels=field.labels(result.name),
+        layer=result.name,
+        evidence=None if result.evidence.kind == "masks" else result.evidence,
+        views=result.views,
+        truth=truth,
+        tree=result.layer if isinstance(result.layer, InstanceTree) else None,
+        run=SegmentationRun(
+            timings={**result.timings, **(timings or {})},
+            peak_bytes=unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
+            command=command,
+            files=_files_of_objects(root, exported),
+            warnings=result.warnings,
+            backend=backend,
+        ),
+    )
+    return path
+
+
+def _files_of_objects(root: Path, exported: Sequence[Exported]) -> dict[int, str]:
+    """The file of each object, within the scene's folder."""
+    return {
+        id: (one.output / file).relative_to(root).as_posix()
+        for one in exported
+        for id, file in one.files.items()
+    }

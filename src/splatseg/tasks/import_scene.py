@@ -1,13 +1,17 @@
 """A splat file of any tool becomes a scene, with its photographs or with virtual cameras."""
 
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib import metadata
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+from msgspec import Meta
 
 from splatseg.core import Capture, Gaussians, Scene
-from splatseg.core.boundary import boundary, convert_fields
+from splatseg.core.boundary import boundary
+from splatseg.core.options import Count
+from splatseg.core.options import options as options_class
 from splatseg.errors import InputError
 from splatseg.importing import Alignment, VirtualViews, align, place_cameras
 from splatseg.io.atomic import check_utf8
@@ -15,58 +19,56 @@ from splatseg.io.captures import read_capture
 from splatseg.io.scene import save_scene
 from splatseg.io.splats import SplatWarning, Values, read_splats, splat_format
 from splatseg.render import BackendName
-from splatseg.tasks._observer import SILENT, Observer
-from splatseg.tasks.new_scene import check_replaceable_scene
+from splatseg.tasks.work import (
+    SILENT,
+    Observer,
+    check_replaceable_scene,
+    scene_of_capture,
+    versions,
+)
 
 UpAxis = Literal["auto", "+x", "-x", "+y", "-y", "+z", "-z"]
 """An axis of the file's frame; auto is what its format usually has."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@options_class(removed={"height": "virtual views are three quarters as high as wide"})
 class ImportOptions:
-    """How a file finds its photographs, or its virtual cameras."""
+    """Photographs of a splat file, or its virtual cameras."""
 
     data: Path | None = None
-    """The capture that the splats were made from. None places virtual cameras."""
+    """The capture that the splats were made from: photographs with poses. None places virtual
+    cameras."""
 
     format: str = "auto"
-    """How the capture is read: auto, or one of `io.captures.FORMATS`."""
+    """Layout of the capture: auto, or one of `io.captures.FORMATS`."""
 
     as_is: bool = False
-    """Take the file as it stands, without comparing it with the photographs."""
+    """Do not compare the file with the photographs, and do not move it."""
 
     strict: bool = False
     """Refuse a file with Gaussians that cannot be rendered, and a capture that lists a photograph
     which is not there; see `read_splats` and `read_capture`."""
 
     linear: tuple[Values, ...] = ()
-    """Which of scales and opacities a PLY file has as they are, where 3DGS has logs and logits."""
+    """Values of a PLY file that are stored as they are, where 3DGS stores logs and logits: scales,
+    opacities."""
 
     up: UpAxis = "auto"
-    """Which way is up, where there is no capture. auto: +y for glTF, -y for all else."""
+    """Up axis, where there is no capture. auto: +y for glTF, -y for all other formats, as most
+    tools write them."""
 
-    max_views: int | None = None
-    """Most virtual cameras to place; None takes 40 around an object and 96 within a room. Every
+    max_views: Count | None = None
+    """Largest number of virtual cameras. None takes 40 around an object and 96 within a room. Every
     eighth is a test view."""
 
-    width: int = 800
-    """Width of the virtual views, pixels."""
-
-    height: int = 600
-    """Height of the virtual views, pixels."""
+    width: Annotated[int, Meta(ge=16)] = 800
+    """Width of the virtual views, pixels; they are three quarters as high."""
 
     kind: Literal["auto", "object", "room"] = "auto"
-    """Whether virtual cameras stand around the scene or within it. auto: within, where the
-    scene surrounds them."""
+    """Placement of virtual cameras: around the scene (object) or within it (room). auto: within,
+    where the scene surrounds them."""
 
     def __post_init__(self) -> None:
-        convert_fields(self)
-        if self.max_views is not None and self.max_views < 1:
-            raise InputError(f"max_views: expected at least 1, got {self.max_views}.")
-        if min(self.width, self.height) < 16:
-            raise InputError(
-                f"width, height: expected at least 16 pixels, got {self.width} and {self.height}."
-            )
         if self.as_is and self.data is None:
             raise InputError("as_is: goes with `data`, which says what the file is compared with.")
 
@@ -103,7 +105,7 @@ def import_scene(
         folder: The scene folder to write. A scene that is there is replaced unless it has
             layers.
         options: The capture, or how cameras are placed.
-        backend: Who renders.
+        backend: Rendering backend.
         observer: Is told of the progress and of what was found.
 
     Raises:
@@ -117,48 +119,76 @@ def import_scene(
     gaussians = read_with_notes(file, observer, strict=options.strict, linear=options.linear)
     if not len(gaussians):
         raise InputError(f"{file}: expected Gaussians, got a file of none.")
-    provenance = _provenance(file, backend)
-    alignment, placed = None, None
-    if options.data is not None:
-        capture = read_capture(options.data, format=options.format, strict=options.strict)
-        for note in capture.notes:
-            observer.note(note)
-        if not options.as_is:
-            alignment = align(gaussians, capture, splats=file, backend=backend)
-            observer.info(_aligned(alignment))
-        scene = _with_photographs(gaussians, capture, alignment, provenance)
-    else:
-        axis = _up_axis(file) if options.up == "auto" else options.up
-        up = _direction(axis)
-        with observer.stage("placing cameras") as step:
-            placed = place_cameras(
-                gaussians,
-                up=up,
-                count=options.max_views,
-                width=options.width,
-                height=options.height,
-                kind=None if options.kind == "auto" else options.kind,
-                backend=backend,
-                progress=step,
-            )
-        scene = _with_cameras(gaussians, up, placed, provenance)
-        observer.info(_placed(placed))
-        if options.up == "auto":
-            observer.info(
-                f"up is {axis}, as is usual in such files; where the views lie on their side, "
-                "say which axis is, such as --up +z"
-            )
-    return ImportedScene(scene=save_scene(scene, folder), alignment=alignment, placed=placed)
-
-
-def _provenance(file: Path, backend: str) -> dict[str, Any]:
-    return {
+    provenance: dict[str, Any] = {
         "command": "import",
         "file": file.name,
         "format": splat_format(file),
         "backend": backend,
-        "versions": {name: metadata.version(name) for name in ("splatseg", "torch")},
+        "versions": versions("splatseg", "torch"),
     }
+    if options.data is None:
+        scene, placed = _with_cameras(
+            file, gaussians, options, provenance=provenance, backend=backend, observer=observer
+        )
+        return ImportedScene(scene=save_scene(scene, folder), alignment=None, placed=placed)
+    capture = read_capture(options.data, format=options.format, strict=options.strict)
+    for note in capture.notes:
+        observer.note(note)
+    alignment = None
+    if not options.as_is:
+        alignment = align(gaussians, capture, splats=file, backend=backend)
+        observer.info(_aligned(alignment))
+        if alignment.moved:
+            gaussians = gaussians.transformed(alignment.capture_from_file)
+    provenance |= _alignment_facts(alignment, capture)
+    scene = scene_of_capture(capture, gaussians, provenance=provenance)
+    return ImportedScene(scene=save_scene(scene, folder), alignment=alignment, placed=None)
+
+
+def _with_cameras(
+    file: Path,
+    gaussians: Gaussians,
+    options: ImportOptions,
+    *,
+    provenance: Mapping[str, Any],
+    backend: BackendName,
+    observer: Observer,
+) -> tuple[Scene, VirtualViews]:
+    """The scene with virtual cameras."""
+    # Nothing in a file says which axis is up in it.
+    usual = "+y" if splat_format(file) == "gltf" else "-y"
+    axis = usual if options.up == "auto" else options.up
+    sign = 1.0 if axis[0] == "+" else -1.0
+    x, y, z = (sign if letter == axis[1] else 0.0 for letter in "xyz")
+    with observer.stage("placing cameras") as step:
+        placed = place_cameras(
+            gaussians,
+            up=(x, y, z),
+            count=options.max_views,
+            width=options.width,
+            height=options.width * 3 // 4,
+            kind=None if options.kind == "auto" else options.kind,
+            backend=backend,
+            progress=step,
+        )
+    where = "around an object" if placed.kind == "object" else "within a room"
+    observer.info(
+        f"{len(placed.views)} virtual cameras {where}; they show "
+        f"{100 * placed.coverage:.0f} % of what is visible"
+    )
+    if options.up == "auto":
+        observer.info(
+            f"up is {axis}, as is usual in such files; where the views lie on their side, "
+            "say which axis is, such as --up +z"
+        )
+    facts = {"kind": placed.kind, "coverage": round(placed.coverage, 4), "up": [x, y, z]}
+    scene = Scene(
+        gaussians=gaussians,
+        views=placed.views,
+        up=(x, y, z),
+        provenance={**provenance, "virtual_views": facts},
+    )
+    return scene, placed
 
 
 def read_with_notes(
@@ -173,47 +203,6 @@ def read_with_notes(
     return gaussians
 
 
-def _with_photographs(
-    gaussians: Gaussians,
-    capture: Capture,
-    found: Alignment | None,
-    provenance: dict[str, Any],
-) -> Scene:
-    if found is not None and found.moved:
-        gaussians = gaussians.transformed(found.capture_from_file)
-    return Scene(
-        gaussians=gaussians,
-        views=capture.views,
-        classes=capture.classes,
-        up=capture.up,
-        metres_per_unit=capture.metres_per_unit,
-        source=capture.path,
-        provenance=provenance | _alignment_facts(found, capture),
-    )
-
-
-def _with_cameras(
-    gaussians: Gaussians,
-    up: tuple[float, float, float],
-    placed: VirtualViews,
-    provenance: dict[str, Any],
-) -> Scene:
-    facts = {"kind": placed.kind, "coverage": round(placed.coverage, 4), "up": list(up)}
-    provenance = provenance | {"virtual_views": facts}
-    return Scene(gaussians=gaussians, views=placed.views, up=up, provenance=provenance)
-
-
-def _up_axis(file: Path) -> str:
-    """The axis that is up in files of this format; nothing in them says so."""
-    return "+y" if splat_format(file) == "gltf" else "-y"
-
-
-def _direction(axis: str) -> tuple[float, float, float]:
-    sign = 1.0 if axis[0] == "+" else -1.0
-    x, y, z = (sign if letter == axis[1] else 0.0 for letter in "xyz")
-    return x, y, z
-
-
 def _aligned(found: Alignment) -> str:
     quality = f"correlation {found.correlation:.2f}, {found.psnr:.1f} dB at a small size"
     if not found.moved:
@@ -221,14 +210,6 @@ def _aligned(found: Alignment) -> str:
     return (
         f"the splats were in another frame (correlation {found.correlation_as_is:.2f}) and were "
         f"moved: {found.what} ({quality})"
-    )
-
-
-def _placed(placed: VirtualViews) -> str:
-    where = "around an object" if placed.kind == "object" else "within a room"
-    return (
-        f"{len(placed.views)} virtual cameras {where}; they show "
-        f"{100 * placed.coverage:.0f} % of what is visible"
     )
 
 

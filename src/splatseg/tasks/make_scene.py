@@ -1,17 +1,17 @@
 """Photographs become a scene: poses where they lack them, a fit, scores, a report."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from splatseg.core import Capture, Scene
+from splatseg.core import Capture, View
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.checkpoints import Checkpoints, deferred_interrupts
 from splatseg.errors import InputError
-from splatseg.evaluate import PhotographReport
+from splatseg.evaluate import PhotographReport, evaluate_photographs, render_and_photograph
+from splatseg.evaluate.photographs import MaskUse
 from splatseg.fit import (
     EXPOSURES,
     FitOptions,
@@ -25,20 +25,37 @@ from splatseg.io.arrays import discard_checkpoint_file
 from splatseg.io.captures import read_start_points
 from splatseg.io.scans import read_scans
 from splatseg.io.scene import save_scene
-from splatseg.io.scene_folder import CHECKPOINT_FILE
-from splatseg.pose import PoseReport
+from splatseg.io.scene_folder import CHECKPOINT_FILE, GAUSSIANS_FILE, POSES_FOLDER, scene_path
+from splatseg.lift import GaussianField
+from splatseg.pose import PoseReport, load_pose_report
 from splatseg.pose.pointmaps import PointmapReport
 from splatseg.render import BackendName
-from splatseg.report.fit_report import FitVerdict
-from splatseg.tasks._depth_evidence import with_depth_evidence
-from splatseg.tasks._fit_moving import capture_without_moving
-from splatseg.tasks._fit_report import score_and_report
-from splatseg.tasks._moving import LeftOut, MovingClock, moving_things, without_moving_points
-from splatseg.tasks._observer import SILENT, Observer
-from splatseg.tasks._photographs import Poses, capture_of
-from splatseg.tasks._scan_depth import with_scans
-from splatseg.tasks.checkpoint_options import CheckpointOptions
-from splatseg.tasks.stopped_fit import check_fit_output, fit_folder
+from splatseg.report.fit_report import FitReportData, FitVerdict, fit_record, fit_report, verdict_of
+from splatseg.report.images import Gallery, GalleryImage, colour_difference
+from splatseg.report.maps import camera_map
+from splatseg.tasks.checkpoints import CheckpointOptions, check_fit_output, fit_folder
+from splatseg.tasks.moving import (
+    LeftOut,
+    MovingClock,
+    capture_without_moving,
+    moving_things,
+    without_moving_points,
+)
+from splatseg.tasks.photographs import (
+    MakeSceneOptions,
+    Poses,
+    capture_of,
+    with_depth_evidence,
+    with_scans,
+)
+from splatseg.tasks.work import (
+    REPORTS_FOLDER,
+    SILENT,
+    Observer,
+    scene_of_capture,
+    versions,
+    write_page,
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -163,7 +180,7 @@ def fit_capture(
             layers.
         options: What is around the fit.
         fit_options: The fit itself; its seed is that of everything that is drawn at random.
-        backend: Who renders.
+        backend: Rendering backend.
         command: The words that started it, for the report; may be empty.
         observer: Is told of the progress.
 
@@ -245,14 +262,10 @@ def _capture(
     else:
         capture, poses = capture_of(
             data,
+            options,
             scene=folder,
-            format=options.format,
-            strict=options.strict,
-            poses=options.poses,
-            pointmaps=options.pointmaps,
             # A fixed fit keeps every point; other strategies thin the cloud themselves.
             max_points=fit_options.max_gaussians if fit_options.strategy == "fixed" else None,
-            frames=options.frames,
             seed=fit_options.seed,
             observer=observer,
         )
@@ -317,21 +330,11 @@ def _fitted(
                 checkpoints=checkpoints,
             )
         provenance = _provenance(record, fit_options, backend, result)
-        _save(folder, capture, result, provenance)
+        scene = scene_of_capture(
+            capture, result.gaussians, views=result.views, provenance=provenance
+        )
+        save_scene(scene, folder)
     return result, interrupts.requested or result.interrupted
-
-
-def _save(folder: Path, capture: Capture, result: FitResult, provenance: dict[str, Any]) -> None:
-    scene = Scene(
-        gaussians=result.gaussians,
-        views=result.views,
-        classes=capture.classes,
-        up=capture.up,
-        metres_per_unit=capture.metres_per_unit,
-        source=capture.path,
-        provenance=provenance,
-    )
-    save_scene(scene, folder)
 
 
 def _beginning(capture: Capture, options: FitOptions) -> str:
@@ -350,7 +353,6 @@ def _beginning(capture: Capture, options: FitOptions) -> str:
 def _record(options: MakeSceneOptions, moving: LeftOut | None) -> dict[str, Any]:
     """What the scene remembers of what is around the fit."""
     return {
-        "preset": options.preset,
         **({} if options.depth_evidence is None else {"depth_evidence": options.depth_evidence}),
         **({} if options.scans is None else {"scans": str(options.scans)}),
         **({} if options.points is None else {"points": str(options.points)}),
@@ -371,5 +373,130 @@ def _provenance(
         "backend": backend,
         "options": asdict(fit_options),
         **({EXPOSURES: exposures_record(result.exposures)} if result.exposures else {}),
-        "versions": {name: metadata.version(name) for name in ("splatseg", "torch")},
+        "versions": versions("splatseg", "torch"),
     }
+
+
+_NEXT = ("worst", "second worst", "third worst")
+
+# Scoring the held-out views may take this long, seconds: writing belongs to the minutes too.
+_SCORING = 20.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FittedScene:
+    """What is known of a fit once it was scored and told."""
+
+    scores: PhotographReport | None
+    """None where no view was scored."""
+
+    report: Path
+    verdict: FitVerdict
+    timings: Mapping[str, float]
+    """Seconds by part of the command."""
+
+
+def score_and_report(
+    root: Path,
+    capture: Capture,
+    result: FitResult,
+    *,
+    options: FitOptions,
+    backend: BackendName,
+    scoring: bool,
+    command: str = "",
+    timings: Mapping[str, float] | None = None,
+    poses: Mapping[str, Any] | None = None,
+) -> FittedScene:
+    """Score the held-out views, write SCENE/reports/fit.html and fit.json.
+
+    As many views are scored as the time for it allows; with `scoring` False none is, for who
+    stopped a fit does not want to wait.
+
+    Args:
+        root: Folder of the scene.
+        capture: What it was fitted to.
+        result: The fit.
+        options: Of the fit.
+        backend: Rendering backend.
+        scoring: Whether held-out views are scored.
+        command: The words that started it; may be empty.
+        timings: Seconds by part of the command until now.
+        poses: How cameras were found; None takes what is kept with the scene.
+    """
+    began = time.monotonic()
+    views = [view for view in capture.test_views if view.image is not None]
+    scores = None
+    if views and scoring:
+        scores = evaluate_photographs(
+            GaussianField(result.gaussians, backend=backend),
+            views,
+            masks=options.masks,
+            seconds=_SCORING,
+        )
+    data = FitReportData(
+        capture=replace(capture, views=result.views or capture.views),
+        options=options,
+        result=result,
+        scores=scores,
+        held_out=len(views),
+        file_bytes=(root / GAUSSIANS_FILE).stat().st_size,
+        command=command,
+        poses=_poses(root) if poses is None else poses,
+        facts={"backend": backend},
+    )
+    pairs = None
+    if scores is not None:
+        pairs = _pairs(result, views, scores, masks=options.masks, backend=backend)
+    cameras = camera_map(result.gaussians, data.capture.views, up=capture.up)
+    spent = {**(timings or {}), "scores and report": time.monotonic() - began}
+    data = replace(data, timings=spent)
+    page = fit_report(data, pairs=pairs, cameras=cameras)
+    where = write_page(page, scene_path(root, REPORTS_FOLDER, "fit.html"), fit_record(data))
+    return FittedScene(scores=scores, report=where, verdict=verdict_of(data), timings=spent)
+
+
+def _pairs(
+    result: FitResult,
+    views: Sequence[View],
+    scores: PhotographReport,
+    *,
+    masks: MaskUse,
+    backend: BackendName,
+) -> Gallery:
+    """Photograph, render and difference of the worst views, the median and the best one."""
+    ordered = sorted(scores.per_view, key=lambda score: score.psnr)
+    median, last = len(ordered) // 2, len(ordered) - 1
+    # Of few views some are two of these; each is shown once.
+    ranks = {0: "worst"} | {i: _NEXT[i] for i in range(1, min(len(_NEXT), median))}
+    ranks |= {median: "median", last: "best"} if last else {0: "the only one"}
+    names = {view.name: view for view in views}
+    rows: list[tuple[str, tuple[GalleryImage, ...]]] = []
+    for rank, label in ranks.items():
+        score = ordered[rank]
+        picture, photograph = render_and_photograph(
+            GaussianField(result.gaussians, backend=backend), names[score.name], masks=masks
+        )
+        rows.append(
+            (
+                f"{label}: {score.name}",
+                (
+                    GalleryImage(image=photograph),
+                    GalleryImage(
+                        image=picture, caption=f"{score.psnr:.2f} dB, SSIM {score.ssim:.3f}"
+                    ),
+                    GalleryImage(image=colour_difference(picture, photograph)),
+                ),
+            )
+        )
+    return Gallery(
+        title="Held-out views, the worst first",
+        columns=("photograph", "rendered", "difference"),
+        rows=tuple(rows),
+        note="The difference is four times as bright as it is.",
+    )
+
+
+def _poses(root: Path) -> dict[str, Any] | None:
+    report = load_pose_report(root / POSES_FOLDER)
+    return None if report is None else asdict(report)

@@ -1,6 +1,5 @@
-"""Words asked of a scene: which things answer to them, and how surely."""
+"""What a scene is asked for words by."""
 
-import importlib.metadata
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
@@ -27,9 +26,11 @@ from splatseg.lift.words import WordAnswers, WordIndex
 from splatseg.methods.voxels.words import VoxelWords
 from splatseg.render import BackendName
 from splatseg.selection import components
-from splatseg.tasks._observer import SILENT, Observer
-from splatseg.tasks._query_sources import word_source
-from splatseg.tasks.query_options import QueryOptions
+from splatseg.tasks.sources import QueryOptions, word_source
+from splatseg.tasks.work import SILENT, Observer, Work, versions
+
+# Words asked of a scene: which things answer to them, and how surely.
+
 
 _THINGS = 20_000
 """Distinct vectors up to which each is a thing; with more, things are connected pieces."""
@@ -164,7 +165,7 @@ class Answers:
             method="query",
             options={**asdict(self.options), "from_layer": self.layer},
             names=dict(enumerate(self.words, start=1)),
-            versions={"splatseg": importlib.metadata.version("splatseg")},
+            versions=versions("splatseg"),
             details=answers_record(self),
         )
 
@@ -183,12 +184,12 @@ class QuerySession:
 
     Args:
         scene: The scene; it must stay as it is.
-        options: Who answers, and how sure is sure.
+        options: What answers, and from which probability.
         encoder: The model that features were made with, for any words; None takes words that were
             recorded with them.
         words: What will be asked for: nothing that takes long is done if one has no vector.
         layers: Layers at hand; others are read from the scene's folder.
-        backend: Who renders.
+        backend: Rendering backend.
         observer: Is told of what is opened.
 
     Raises:
@@ -209,15 +210,8 @@ class QuerySession:
     ) -> None:
         self._scene = scene
         self._options = options or QueryOptions()
-        self._source = word_source(
-            scene,
-            self._options,
-            encoder=encoder,
-            words=words,
-            layers=layers,
-            backend=backend,
-            observer=observer,
-        )
+        work = Work(scene=scene, layers=layers, backend=backend, observer=observer)
+        self._source = word_source(work, self._options, encoder=encoder, words=words)
         if len(self._source.features) != len(scene.gaussians):
             raise InputError(
                 f"from_layer: expected {len(scene.gaussians)} Gaussians, those of the scene, "
@@ -403,10 +397,10 @@ def query(
     Args:
         scene: The scene.
         words: Words or phrases.
-        options: Who answers, and how sure is sure.
+        options: What answers, and from which probability.
         encoder: The model that features were made with; None takes recorded words.
         layers: Layers at hand; others are read from the scene's folder.
-        backend: Who renders.
+        backend: Rendering backend.
         observer: Is told of what is opened.
 
     Raises:

@@ -1,21 +1,28 @@
 """Views of a scene, or a path through it, as PNG files and films."""
 
 import math
+import re
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import UInt8
+from PIL import Image
 from torch import Tensor
 
 from splatseg.core import (
     UNLABELLED,
+    Capture,
     ClassTable,
+    LabelledMesh,
+    LabelledPoints,
     Layer,
+    LayerInfo,
     Renderable,
     RenderableLayer,
     RenderableView,
@@ -23,21 +30,104 @@ from splatseg.core import (
     View,
     ViewSignals,
 )
-from splatseg.core.boundary import boundary, convert_fields
+from splatseg.core.boundary import boundary
+from splatseg.core.options import Count
+from splatseg.core.options import options as options_class
 from splatseg.errors import InputError
+from splatseg.evaluate import PointSurfaceOptions, SurfaceField
 from splatseg.evaluate.held_out import label_map_in
 from splatseg.io.arrays import read_npy
 from splatseg.io.atomic import atomic_folder, path_inside, sweep
-from splatseg.io.images import save_png
+from splatseg.io.cameras import cameras_content
+from splatseg.io.images import check_encoder, save_png, write_video
 from splatseg.io.json_files import read_json, write_json
-from splatseg.io.scene import scene_layer_names
+from splatseg.io.surfaces import read_surface
 from splatseg.lift import GaussianField
 from splatseg.render import BackendName
 from splatseg.report.colours import colour_labels, layer_colours, legend_of
-from splatseg.tasks._film import check_film, path_views, write_film, write_path
-from splatseg.tasks._observer import SILENT, Observer
-from splatseg.tasks.new_scene import check_parent_writable
-from splatseg.tasks.scene_parts import gaussian_field, views_of_split
+from splatseg.report.images import colour_depth
+from splatseg.tasks.work import SILENT, Observer, Work, check_parent_writable, scene_of_capture
+
+# Depths beyond these shares of all are shown in the end colours.
+_NEAR, _FAR = 0.01, 0.99
+
+
+def write_path(views: Sequence[View], folder: Path, *, pictures: bool) -> None:
+    """The cameras of a path as nerfstudio's transforms.json, with the pictures if there are."""
+    shown = [
+        View(
+            name=view.name,
+            camera=view.camera,
+            split=view.split,
+            image=folder.absolute() / "rgb" / f"{view.name}.png" if pictures else None,
+        )
+        for view in views
+    ]
+    write_json(
+        cameras_content(shown, folder=folder.absolute(), source=None), folder / "transforms.json"
+    )
+
+
+def check_film(views: Sequence[View], *, fps: float) -> None:
+    """Refuse before the work what the encoder could not do after it.
+
+    Raises:
+        InputError: If the views differ in size.
+        RangeError: If `fps` is out of range.
+        MissingPackageError: If there is no encoder.
+    """
+    sizes = sorted({(view.camera.width, view.camera.height) for view in views})
+    if len(sizes) > 1:
+        shown = ", ".join(f"{width}x{height}" for width, height in sizes[:4])
+        raise InputError(f"video: expected views of one size, got {shown}; a path has.")
+    check_encoder(fps)
+
+
+def write_film(
+    views: Sequence[View],
+    folder: Path,
+    *,
+    fps: float,
+    is_label_map: bool,
+    classes: ClassTable | None,
+) -> None:
+    """A film beside a folder of pictures: ``rgb.mp4`` beside ``rgb/``.
+
+    Depth is shown from near, light, to far, dark, on one scale for the whole film; labels in
+    the colours of the legend.
+    """
+    files = [folder / f"{view.name}.png" for view in views]
+    if is_label_map:
+        frames = (_coloured_ids(file, classes) for file in files)
+    elif folder.name == "depth":
+        frames = _film_depths(files, unit=float(read_json(folder / "depth.json")["unit"]))
+    else:
+        frames = (_film_colours(file) for file in files)
+    write_video(frames, folder.with_name(f"{folder.name}.mp4"), fps=fps)
+
+
+def _film_depths(files: Sequence[Path], *, unit: float) -> Generator[UInt8[Tensor, "h w 3"]]:
+    sample = np.concatenate([_read(file)[::7, ::7].reshape(-1) for file in files])
+    known = sample[sample > 0]
+    near, far = (np.quantile(known, (_NEAR, _FAR)) * unit).tolist() if len(known) else (0.0, 1.0)
+    for file in files:
+        yield colour_depth(torch.from_numpy(_read(file) * unit), near=near, far=far)
+
+
+def _coloured_ids(file: Path, classes: ClassTable | None) -> UInt8[Tensor, "h w 3"]:
+    ids = torch.from_numpy(_read(file).astype(np.int32))
+    return colour_labels(torch.where(ids == 0, -1, ids), classes)
+
+
+def _film_colours(file: Path) -> UInt8[Tensor, "h w 3"]:
+    with Image.open(file) as image:
+        return torch.from_numpy(np.array(image.convert("RGB")))
+
+
+def _read(file: Path) -> np.ndarray:
+    with Image.open(file) as image:
+        return np.array(image).astype(np.float64)
+
 
 _PICTURES = ("rgb", "depth", "alpha")
 _RECORD = "render.json"
@@ -46,31 +136,29 @@ _SOLID = 0.5
 _DEEPEST = 65535
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@options_class
 class RenderingOptions:
     """What is drawn of a scene."""
 
     split: str = "test"
-    """Which views: test, train, another split of the scene, all, or path: a smooth path near the
+    """Views: test, train, another split of the scene, all, or path: a smooth path near the
     training cameras."""
 
     what: tuple[str, ...] = ("rgb",)
-    """What to draw: rgb, depth, alpha, and names of layers."""
+    """What to draw: rgb, depth, alpha, and names of layers. NAME@part is a cut of a tree; NAME@hard
+    reads features of each Gaussian instead of each pixel."""
 
     coloured: bool = False
-    """Also write DIR/<layer>_coloured with pictures of label layers in the legend's colours."""
+    """Also write DIR/<layer>_coloured with label layers in the colours of the legend."""
 
     video: bool = False
     """Also write DIR/<what>.mp4: depth and labels in colours. Needs splatseg[video]."""
 
-    frames: int = 360
-    """Views of split path."""
+    frames: Count = 360
+    """Number of views of split path."""
 
     fps: float = 24.0
-    """Frames a second of the films."""
-
-    def __post_init__(self) -> None:
-        convert_fields(self)
+    """Frames per second of the films."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -118,24 +206,23 @@ def render_views(
         layers: Layers at hand; others are read from the scene's folder.
         field: What is rendered, with layers of its own; None is the scene's Gaussians with
             theirs.
-        backend: Who renders the Gaussians.
+        backend: Rendering backend of the Gaussians.
         observer: Is told of the progress.
 
     Raises:
         InputError: If there is no such layer or split, or something else lies in the way.
     """
     options = options or RenderingOptions()
-    on_path = options.split == "path" and all(view.split != "path" for view in scene.views)
-    wanted = _wanted(options.what)
+    work = Work(scene=scene, layers=layers, backend=backend, observer=observer)
+    if not options.what:
+        raise InputError("what: expected rgb, depth, alpha or names of layers, got nothing.")
+    wanted = list(dict.fromkeys(options.what))
     names = [name for name in wanted if name not in _PICTURES]
-    _check_layers(scene, names, layers, field)
+    _check_layers(names, {*(work.layer_names if field is None else field.layer_names)})
     if field is None:
-        field = gaussian_field(scene, names, layers, backend=backend)
+        field = work.field(names)
     drawn = _layers(scene, field, names)
-    if on_path:
-        views = path_views(scene, field, frames=options.frames)
-    else:
-        views = views_of_split(scene, options.split)
+    views, on_path = work.split_or_path(options.split, frames=options.frames, shown=field)
     label_maps = [layer.name for layer in drawn if not layer.is_selection]
     folders = _folders(wanted, label_maps if options.coloured else [])
     if options.video:
@@ -201,12 +288,6 @@ def _render(
                 write_json(legend, into[layer.name] / "legend.json")
 
 
-def _wanted(what: Sequence[str]) -> list[str]:
-    if not what:
-        raise InputError("what: expected rgb, depth, alpha or names of layers, got nothing.")
-    return list(dict.fromkeys(what))
-
-
 def _folders(wanted: Sequence[str], coloured: Sequence[str]) -> list[str]:
     folders = [*wanted, *(f"{name}_coloured" for name in coloured)]
     if len({name.casefold() for name in folders}) != len(folders):
@@ -214,17 +295,8 @@ def _folders(wanted: Sequence[str], coloured: Sequence[str]) -> list[str]:
     return folders
 
 
-def _check_layers(
-    scene: Scene,
-    names: Sequence[str],
-    at_hand: Mapping[str, Layer] | None,
-    field: Renderable | None,
-) -> None:
+def _check_layers(names: Sequence[str], known: set[str]) -> None:
     """Refuse a name that no layer has."""
-    if field is not None:
-        known = {*field.layer_names}
-    else:
-        known = {*(at_hand or {}), *(() if scene.root is None else scene_layer_names(scene.root))}
     for name in names:
         if name.partition("@")[0] not in known:
             raise InputError(
@@ -353,3 +425,61 @@ def _save(image: Tensor, folder: Path, view: View) -> None:
 def _file(folder: Path, view: View, suffix: str) -> Path:
     """Where a view's file goes; names with a slash go into subfolders."""
     return path_inside(folder, f"{view.name}{suffix}")
+
+
+_NO_CLASSES = re.compile(r"instance|object|part|segment|track", re.IGNORECASE)
+"""Names of labels that are no classes, so that the class table does not name them."""
+
+
+@boundary
+def render_truth(
+    surface: LabelledMesh | LabelledPoints | Path,
+    source: Scene | Capture,
+    output: Path,
+    *,
+    options: RenderingOptions | None = None,
+    points: PointSurfaceOptions | None = None,
+    zero_is_class: bool = False,
+    void: int | None = None,
+    observer: Observer = SILENT,
+) -> Rendering:
+    """Draw what views see of a labelled surface, as `render_views` draws Gaussians.
+
+    OUTPUT/<labels>/<view>.png has the ids, 16 bit, 0 where nothing is met or the label is void, in
+    the photograph's own pixels: what `evaluate_scene` takes as truth.
+
+    Args:
+        surface: A mesh or points in the world of the views, or a file of them, see
+            `splatseg.io.surfaces.read_surface`.
+        source: Whose views are drawn; of a scene the Gaussians are not looked at.
+        output: Folder to write to.
+        options: Which views, and which labels of the surface (`what`), perhaps depth and alpha;
+            nothing in `what` is all labels, and None those of the test views.
+        points: How points become a surface.
+        zero_is_class: Of a file: the id 0 is a class and not void, ids grow by 1.
+        void: Of a file: a further id that means void.
+        observer: Is told of the progress.
+
+    Raises:
+        InputError: If the surface has no such labels, there is no such split, or something else
+            lies in the way.
+        MissingPackageError: If embreex is not installed.
+    """
+    source_ids = isinstance(surface, Path) and zero_is_class
+    if isinstance(surface, Path):
+        surface = read_surface(surface, zero_is_class=zero_is_class, void=void)
+    infos = {name: _info(name, ids, source_ids=source_ids) for name, ids in surface.labels.items()}
+    field = SurfaceField(surface, points=points, infos=infos)
+    options = options or RenderingOptions(what=())
+    if not options.what:
+        options = replace(options, what=tuple(surface.labels))
+    scene = source if isinstance(source, Scene) else scene_of_capture(source)
+    return render_views(scene, output, options=options, field=field, observer=observer)
+
+
+def _info(name: str, ids: Tensor, *, source_ids: bool) -> LayerInfo:
+    present = [int(id) for id in ids.unique().tolist() if id >= 0]
+    return LayerInfo(
+        names={id: f"{name} {id}" for id in present} if _NO_CLASSES.search(name) else {},
+        source_ids={id: id - 1 for id in present} if source_ids else None,
+    )

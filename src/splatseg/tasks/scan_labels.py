@@ -5,25 +5,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from splatseg._check import check_choice
 from splatseg.core import Labels, Layer, PointLabels, Renderable, Scan, ScanSource, Scene
-from splatseg.core.boundary import boundary, convert_fields
+from splatseg.core.boundary import boundary
+from splatseg.core.options import options as options_class
 from splatseg.errors import InputError
 from splatseg.io.export import (
-    FORMS,
     ScanLabelCounts,
     ScanLabelForm,
     check_replaceable,
     write_scan_labels,
 )
 from splatseg.io.scans import Scans, read_scans
-from splatseg.io.scene import load_scene_layer, scene_layer_names
 from splatseg.lift.viewed_points import ViewedPointOptions, ViewedPoints
 from splatseg.render import BackendName
 from splatseg.street.block_field import DriveField, ScanLabeller
 from splatseg.street.field import MeshField
-from splatseg.tasks._observer import SILENT, Observer
-from splatseg.tasks.scene_parts import gaussian_field
+from splatseg.tasks.work import SILENT, Observer, Work
 
 LabelBy = Literal["gaussians", "mesh", "vertices"]
 """gaussians: what views of the Gaussians show at a point, and its shape. mesh: the same of the mesh
@@ -34,23 +31,20 @@ _LABEL_FILES = ("semantic-kitti", "kitti-raw", "kitti-odometry", "kitti360")
 """Formats whose points come as ``.bin``, for which SemanticKITTI has a form of labels."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@options_class
 class ScanLabelOptions:
-    """How points of scans take labels, and how these are written."""
+    """Layer that labels points of scans, and the files that are read and written."""
 
     layer: str | None = None
     """Name of the layer of labels. None takes the only one there is."""
 
     form: ScanLabelForm | Literal["auto"] = "auto"
-    """npz: semantic and confidence, a value for each of the scan's file. label: SemanticKITTI's.
-    ply, las: points with columns. auto: label, ply or las where scans came as such, else npz."""
+    """Format of the files of labels. npz: semantic and confidence, one value per point of the
+    scan's file. label: SemanticKITTI's. ply, las: points with columns. auto: the format of the
+    scans where that is label, ply or las, else npz."""
 
     scan_format: str = "auto"
-    """How scans are read: auto, or one of `io.scans.FORMATS`."""
-
-    def __post_init__(self) -> None:
-        convert_fields(self)
-        check_choice("form", self.form, ("auto", *FORMS))
+    """Layout of the scans: auto, or one of `io.scans.FORMATS`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -111,7 +105,7 @@ def label_scans(
         points: How points take labels from views of the Gaussians; with a field none.
         layers: Layers at hand; others are read from the scene's folder.
         seen: Is given every scan with its labels.
-        backend: Who renders the Gaussians.
+        backend: Rendering backend of the Gaussians.
         observer: Is told of the progress.
 
     Raises:
@@ -122,8 +116,14 @@ def label_scans(
     if isinstance(scans, Path):
         scans = scans_to_label(scans, folder, options=options)
     if field is None:
-        layer = options.layer or _only_layer(scene, layers)
-        field = _viewed_gaussians(scene, layer, points, layers, backend)
+        work = Work(scene=scene, layers=layers, backend=backend, observer=observer)
+        layer = options.layer or _only_layer(work)
+        if not len(scene.gaussians):
+            raise InputError(
+                "by: expected mesh for a scene without Gaussians, got gaussians; `splatseg fit` "
+                "makes a scene with them."
+            )
+        field = viewed_points(scene, work.field([layer]), options=points)
         if scene.metres_per_unit is None:
             observer.note("the scene does not say how long its unit is; a metre is assumed")
     else:
@@ -137,7 +137,7 @@ def label_scans(
     rule = _vertex_rule(field, layer)
     with observer.stage("label scans") as step:
         counts = write_scan_labels(
-            _told(_labelled(field, scans, layer, step), seen),
+            _tapped(_labelled(field, scans, layer, step), seen),
             folder,
             form=form,
             array_shape=scans.array_shape if form == "npz" else None,
@@ -161,7 +161,7 @@ def _vertex_rule(field: Renderable, layer: str) -> str | None:
     return None
 
 
-def _told(
+def _tapped(
     found: Iterator[tuple[Scan, PointLabels]], seen: Callable[[Scan, PointLabels], None] | None
 ) -> Iterator[tuple[Scan, PointLabels]]:
     """The same scans, of which someone else hears too."""
@@ -225,31 +225,12 @@ def viewed_points(
     )
 
 
-def _viewed_gaussians(
-    scene: Scene,
-    layer: str,
-    points: ViewedPointOptions | None,
-    layers: Mapping[str, Layer] | None,
-    backend: BackendName,
-) -> ViewedPoints:
-    if not len(scene.gaussians):
-        raise InputError(
-            "by: expected mesh for a scene without Gaussians, got gaussians; `splatseg fit` makes "
-            "a scene with them."
-        )
-    field = gaussian_field(scene, [layer], layers, backend=backend)
-    return viewed_points(scene, field, options=points)
-
-
-def _only_layer(scene: Scene, layers: Mapping[str, Layer] | None) -> str:
+def _only_layer(work: Work) -> str:
     """The only layer of labels."""
-    if layers:
-        return _only([n for n, layer in layers.items() if isinstance(layer, Labels)], "layers")
-    if scene.root is None:
+    if not work.layers and work.scene.root is None:
         raise InputError("layer: expected a name, the scene has no folder to look for layers in.")
-    names = scene_layer_names(scene.root)
-    labels = [n for n in names if isinstance(load_scene_layer(scene.root, n), Labels)]
-    return _only(labels, str(scene.root))
+    names = [name for name in work.layers or work.layer_names if work.facts(name).kind is Labels]
+    return _only(names, "layers" if work.layers else str(work.scene.root))
 
 
 def _only(names: Sequence[str], where: str) -> str:

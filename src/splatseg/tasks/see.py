@@ -1,20 +1,28 @@
 """A 2D model looks at a scene's photographs, and what it sees is written down."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import field, replace
 from pathlib import Path
-from typing import Literal
+from typing import TypeVar
 
-from splatseg.core import Model, Scene, View
-from splatseg.core.boundary import boundary, convert_fields
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from splatseg.core import Model, PromptableMasks, Renderable, Scene, View
+from splatseg.core.boundary import boundary
+from splatseg.core.models import Image
+from splatseg.core.options import options
+from splatseg.core.typed_text import typed_field
 from splatseg.errors import InputError
 from splatseg.io.evidence import (
     RENDERS_FOLDER,
-    Evidence,
     EvidenceKind,
+    evidence_names,
     find_evidence,
-    open_evidence,
+    save_render,
 )
+from splatseg.io.images import image_camera, load_image
 from splatseg.io.scene import check_name
 from splatseg.io.scene_folder import scene_path, work_on_scene
 from splatseg.models import (
@@ -24,72 +32,68 @@ from splatseg.models import (
     SeenEvidence,
     TrackingOptions,
     What,
+    find_family,
     find_model,
     model_names,
     record_evidence,
 )
 from splatseg.models.recorded import recorded_model
-from splatseg.render import BackendName
-from splatseg.tasks._observer import SILENT, Observer
-from splatseg.tasks._view_images import ViewImages
-from splatseg.tasks.scene_parts import views_asked, views_recorded
+from splatseg.render import BackendName, PreparedView
+from splatseg.tasks.work import EVIDENCE_FOLDER, SILENT, Observer, Work, view_spec
 
-EVIDENCE_FOLDER = "evidence"
+T = TypeVar("T")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@options(
+    removed={"precision": "features are cached in float16; a cache of an earlier version is read"}
+)
 class SeeOptions:
-    """What a model is asked, of which views, and what is kept."""
+    """What a model predicts, of which views, and what is kept."""
 
     what: tuple[What, ...] = ()
-    """What to ask the model for; nothing takes what it has, masks before the others. Of several
-    each further one is written to NAME.WHAT, and each image passes the network once."""
+    """What to predict: masks, labels, panoptic, features, text, depth, tracked. Empty takes what
+    the model offers, masks first. Of several, separated by commas or spaces, each further one is
+    written to NAME.WHAT, and each image passes the network once."""
 
     views: tuple[str, ...] = ("train",)
-    """Which views: train, all, or names of views. It is recorded with the evidence."""
+    """Views: train, all, or names, separated by commas or spaces. Recorded with the evidence."""
 
     allow_missing: bool = False
-    """Take the views that recorded evidence has, where some that are asked for are missing."""
+    """Use the views that recorded evidence has, where some of the requested ones are missing."""
 
     zero_is_class: bool = False
-    """The id 0 of recorded label maps is a class and not void: ids grow by 1."""
+    """The id 0 of recorded label maps is a class, not void: ids grow by 1."""
 
     void: int | None = None
-    """A further id of recorded label maps that means none, such as 255."""
+    """A further id of recorded label maps that means void, such as 255."""
 
     suffix: str = ""
-    """What stands in the names of recorded files between the view and the ending, such as _pred
-    for 000_pred.png; files without it are left aside."""
+    """Text between the view's name and the ending in names of recorded files, such as _pred for
+    000_pred.png; files without it are skipped."""
 
     classes: str | None = None
     """Names of the ids of recorded label maps: ade20k, coco, cityscapes, scannet, kitti360,
-    semantic-kitti or voc, for the ids of their annotations, with -train behind it for the ids that
-    networks learn; or a JSON file with "classes" (id, name, isthing, colour), where 0 is a class
-    if it is called so; or CVAT's labelmap.txt. Pictures in a table's colours are read by it."""
+    semantic-kitti or voc for the ids of their annotations, with the suffix -train for the ids that
+    networks predict; or a JSON file with "classes" (id, name, isthing, colour); or CVAT's
+    labelmap.txt. Pictures in a table's colours are read by it."""
 
     depth_unit: float | None = None
     """Metres of one step of recorded depth maps that are pictures or .npy files, such as 0.001.
-    Without it those are relative: inverse depth up to a scale and a shift."""
+    None: they hold inverse depth up to scale and shift."""
 
     cache: Path | None = None
-    """Folder where the model's answers are kept by the content of the photographs, for other
-    scenes of them."""
-
-    precision: Literal["float16", "int8"] = "float16"
-    """How features are kept in the cache."""
+    """Folder that keeps the model's answers by the content of the photographs, for other scenes
+    with the same photographs."""
 
     seeds: str | None = None
-    """Name of the evidence that says what a tracker is to follow: masks, panoptic segments,
-    labels or tracks of some views, of the scene or its capture."""
+    """Evidence that says what a tracker follows: masks, panoptic segments, labels or tracks of
+    some views, of the scene or its capture."""
 
     tracking: TrackingOptions = field(default_factory=TrackingOptions)
-    """Which of the seeds count, and the order of the views."""
+    """Which seeds count, and the order of the views."""
 
     overwrite: bool = False
     """Replace evidence of this name, once the new one is complete."""
-
-    def __post_init__(self) -> None:
-        convert_fields(self)
 
 
 @boundary
@@ -120,7 +124,7 @@ def see(
         model_options: Options of the model's family, such as `ClassicalOptions`; None takes its
             defaults.
         loading: The model's weights, and where and how it runs.
-        backend: Who renders views without photographs.
+        backend: Rendering backend, for views without photographs.
         observer: Is told of the progress.
 
     Raises:
@@ -132,28 +136,28 @@ def see(
         BackendError: If an image does not fit the memory of the device.
     """
     options = options or SeeOptions()
+    work = Work(scene=scene, backend=backend, observer=observer)
     check_name("evidence", evidence)
-    if scene.root is None:
-        raise InputError("scene: expected one that was read from its folder, got one without.")
-    views = views_asked(scene, options.views)
+    root = work.root
+    views = work.views(options.views)
     found = _model(model, options, model_options, loading, observer, views=scene.views)
-    seeds = _seeds(scene, options.seeds)
+    seeds = None if options.seeds is None else work.evidence(options.seeds)
     tracking = None if seeds is None and options.tracking == TrackingOptions() else options.tracking
-    cache = None
-    if options.cache is not None:
-        cache = ModelCache(folder=options.cache, precision=options.precision, report=observer.note)
+    cache = (
+        None if options.cache is None else ModelCache(folder=options.cache, report=observer.note)
+    )
     if found.note:
         observer.note(f"{found.name}: {found.note}")
-    folder = scene_path(scene.root, EVIDENCE_FOLDER, evidence)
-    images = ViewImages(scene, backend=backend)
-    with work_on_scene(scene.root, "see"), observer.stage("see") as step:
+    folder = scene_path(root, EVIDENCE_FOLDER, evidence)
+    images = ViewImages(work)
+    with work_on_scene(root, "see"), observer.stage("see") as step:
         seen = record_evidence(
             found,
             views,
             folder,
             EvidenceRequest(
-                what=options.what,
-                view_spec=views_recorded(options.views),
+                what=options.what or None,
+                view_spec=view_spec(options.views),
                 overwrite=options.overwrite,
                 allow_missing=options.allow_missing,
                 cache=cache,
@@ -164,23 +168,18 @@ def see(
             progress=step,
         )
     if images.drawn:
-        seen = replace(seen, notes=(*seen.notes, _rendered(images.drawn, folder)))
+        was = "view that has no photograph was"
+        were = "views that have no photograph were"
+        note = (
+            f"{images.drawn} {was if images.drawn == 1 else were} rendered for the model; the "
+            f"renders are in {folder / RENDERS_FOLDER}."
+        )
+        seen = replace(seen, notes=(*seen.notes, note))
     for note in seen.notes:
         observer.note(note)
     if cache is not None:
         observer.note(f"{cache.folder}: {cache.size()}")
     return seen
-
-
-def _seeds(scene: Scene, name: str | None) -> Evidence | None:
-    return None if name is None else open_evidence(find_evidence(scene.evidence_folders, name))
-
-
-def _rendered(drawn: int, folder: Path) -> str:
-    views = (
-        "view that has no photograph was" if drawn == 1 else "views that have no photograph were"
-    )
-    return f"{drawn} {views} rendered for the model; the renders are in {folder / RENDERS_FOLDER}."
 
 
 def _model(
@@ -221,3 +220,214 @@ def _model(
             f"elsewhere, got model {name}."
         )
     return model
+
+
+_LOADING = ("size", "dtype", "batch")
+"""Options of loading that each model may have its own of."""
+
+
+def model_of(
+    named: str, *, download: bool = False, device: str = "auto", report: Callable[[str], None]
+) -> Model:
+    """The model of ``NAME[=WEIGHTS][,OPTION=VALUE...]``, or a folder.
+
+    What follows a comma without an ``=`` goes on with the value before it.
+
+    Args:
+        named: The word.
+        download: Whether weights that are not on this machine may be fetched.
+        device: Where it runs.
+        report: Told in a sentence what the user should know.
+
+    Raises:
+        InputError: If there is none, or it has no such option.
+    """
+    name = name_of(named)
+    family = find_family(name) if name in model_names() else None
+    if family is None:
+        return find_model(named, report=report)
+    first, *rest = _pieces(named)
+    weights = first.partition("=")[2]
+    if weights and not family.needs_weights:
+        raise InputError(f"models: {name} has no weights, got {named!r}.")
+    loading = LoadOptions(weights=weights or None, download=download, device=device)
+    chosen = family.options()
+    for text in rest:
+        if family.needs_weights and text.partition("=")[0] in _LOADING:
+            field, value = typed_field(LoadOptions, text, what=f"model {name}")
+            loading = replace(loading, **{field: value})
+        else:
+            field, value = typed_field(family.options, text, what=f"model {name}")
+            chosen = replace(chosen, **{field: value})
+    return find_model(
+        name, chosen, loading=loading if family.needs_weights else None, report=report
+    )
+
+
+def model_for(
+    option: str,
+    named: str,
+    protocol: type[T],
+    does: str,
+    *,
+    download: bool = False,
+    device: str = "auto",
+    report: Callable[[str], None],
+) -> T:
+    """The model that an option names, which must do what the option needs.
+
+    Args:
+        option: The option, for messages.
+        named: As `model_of` takes it.
+        protocol: What the model must be.
+        does: The same in words: ``expected a model that ...``.
+        download: Whether weights that are not on this machine may be fetched.
+        device: Where it runs.
+        report: Told in a sentence what the user should know.
+
+    Raises:
+        InputError: If there is no such model, or it does something else.
+    """
+    model = model_of(named, download=download, device=device, report=report)
+    if not isinstance(model, protocol):
+        raise InputError(f"{option}: expected a model that {does}, got {model.name}.")
+    return model
+
+
+def prompter_of(
+    named: str,
+    scene: Scene,
+    *,
+    download: bool = False,
+    device: str = "auto",
+    report: Callable[[str], None],
+) -> PromptableMasks:
+    """A model that predicts masks at points in views of a scene.
+
+    Args:
+        named: As `model_of` takes it, or the name of masks of the scene or its capture: of those
+            the ones at a point answer.
+        scene: The scene whose photographs it will see.
+        download: Whether weights that are not on this machine may be fetched.
+        device: Where it runs.
+        report: Told in a sentence what the user should know.
+    """
+    folders = scene.evidence_folders
+    folder = find_evidence(folders, named) if named in evidence_names(folders) else Path(named)
+    if name_of(named) in model_names() or not folder.is_dir():
+        return model_for(
+            "prompter",
+            named,
+            PromptableMasks,
+            "answers points",
+            download=download,
+            device=device,
+            report=report,
+        )
+    model = recorded_model(folder, views=scene.views)
+    if not isinstance(model, PromptableMasks):
+        raise InputError(f"prompter: expected a model that answers points, got {model.name}.")
+    return model
+
+
+def name_of(named: str) -> str:
+    """The name of a model that was given with weights and options."""
+    return named.split(",")[0].partition("=")[0]
+
+
+def _pieces(named: str) -> list[str]:
+    """The name with its weights, then each option."""
+    found: list[str] = []
+    for piece in named.split(","):
+        if len(found) > 1 and "=" not in piece:
+            found[-1] += f",{piece}"
+        else:
+            found.append(piece)
+    return found
+
+
+_GREYS = (0.0, 1.0, 0.5)
+# A scene that fills its views has no background to speak of, and it stays black.
+_EMPTY = 0.05
+_ALIKE = 0.15
+_SOLID = 0.9
+_LOOKED_AT = 12
+_SMALL = 128
+
+
+class ViewImages:
+    """Gives the picture of a view, and keeps those that it drew beside the evidence.
+
+    Models see images only; that some of them are renders is this task's business. What nothing
+    covers is of the grey (black, white, half) that the scene itself has least of, so that a dark
+    thing has an outline.
+
+    Args:
+        work: The scene whose Gaussians are drawn.
+    """
+
+    def __init__(self, work: Work) -> None:
+        self._field = work.field()
+        self._views = tuple(view for view in work.scene.views if view.image is None)
+        self._background: float | None = None
+        self.drawn = 0
+        """Views drawn so far."""
+
+    def __call__(self, view: View, folder: Path) -> Image:
+        """The photograph of a view, uint8 (H, W, 3); its render where it has none.
+
+        Args:
+            view: The view.
+            folder: The evidence as it is being written; renders are kept in its ``_renders``.
+
+        Raises:
+            MissingFileError: If the view has a photograph that is not where it was.
+            FileFormatError: If it cannot be decoded, or its size is not the camera's.
+        """
+        if view.image is not None:
+            return load_image(view)
+        if self._background is None:
+            self._background = background_of(self._field, self._views)
+        colour, alpha = _drawn_view(self._field, view)
+        over = (colour + (1 - alpha)[..., None] * self._background).clamp(0, 1)
+        image = (over * 255 + 0.5).to(torch.uint8)
+        save_render(image, folder, view.name)
+        self.drawn += 1
+        return image
+
+
+def shown_image(view: View, prepared: PreparedView) -> UInt8[Tensor, "height width 3"]:
+    """The photograph of a view, or the render of it."""
+    if view.image is not None:
+        return load_image(view)
+    with torch.no_grad():
+        colour = prepared.render().image
+    return (colour.cpu().clamp(0, 1) * 255 + 0.5).to(torch.uint8)
+
+
+def background_of(field: Renderable, views: Sequence[View]) -> float:
+    """The grey, 0 to 1, that fewest solid pixels of some views resemble; black if none is empty.
+
+    It depends on the field and on all views, not on which of them are asked for, so that work
+    that was stopped goes on over the same.
+    """
+    step = max(1, len(views) // _LOOKED_AT)
+    drawn = [_drawn_view(field, view, longest=_SMALL) for view in views[::step][:_LOOKED_AT]]
+    alpha = torch.cat([alpha.flatten() for _, alpha in drawn])
+    if float((1 - alpha).mean()) < _EMPTY:
+        return _GREYS[0]
+    colours = torch.cat([colour.flatten(0, 1) for colour, _ in drawn])[alpha > _SOLID]
+    alike = [int(((colours - grey).abs() < _ALIKE).all(dim=1).sum()) for grey in _GREYS]
+    return _GREYS[alike.index(min(alike))]
+
+
+def _drawn_view(
+    field: Renderable, view: View, *, longest: int | None = None
+) -> tuple[Float[Tensor, "height width 3"], Float[Tensor, "height width"]]:
+    """Colour over black, and alpha."""
+    camera = view.camera if longest is None else image_camera(view, longest)
+    with field.view(camera) as looked_at:
+        signals = looked_at.signals()
+    if signals.colour is None:
+        raise InputError("field: expected one with colours, got one without.")
+    return signals.colour, signals.alpha

@@ -1,18 +1,14 @@
 """Evidence becomes a layer of a scene, by any method."""
 
-import importlib.metadata
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
-
-import torch
+from typing import Any, Literal
 
 from splatseg.core import (
     UNLABELLED,
     ClassTable,
-    Features,
     InstanceTree,
     Labels,
     Layer,
@@ -22,34 +18,84 @@ from splatseg.core import (
 )
 from splatseg.core.boundary import boundary
 from splatseg.core.instance_tree import layer_kind
+from splatseg.core.options import options as options_class
+from splatseg.edit import Document, save_document
+from splatseg.edit.document import BASE, HISTORY
 from splatseg.errors import InputError
 from splatseg.io.arrays import discard_checkpoint_file
 from splatseg.io.evidence import (
     Evidence,
-    TrackedEvidence,
-    check_map_sizes,
-    find_evidence,
-    open_evidence,
-    without_masked,
 )
 from splatseg.io.scene import check_name, save_scene_layer
 from splatseg.lift.completion.complete import CompletionOptions, complete
 from splatseg.lift.segments.panoptic import merge_panoptic
 from splatseg.methods import Method, MethodInputs, Refined, find_method
 from splatseg.render import BackendName
-from splatseg.tasks._observer import SILENT, Observer
-from splatseg.tasks._refined_scene import refined_folder, save_refined
-from splatseg.tasks._segment_inputs import (
+from splatseg.tasks.checkpoints import (
+    CheckpointOptions,
+    training_checkpoints,
+    with_resume_hint,
+)
+from splatseg.tasks.segment_inputs import (
+    check_fit,
+    classes_to_merge,
+    evidence_to_lift,
     named_companions,
     named_models,
     trained_features,
+    unmasked,
+    views_to_lift,
     with_companions,
 )
-from splatseg.tasks.checkpoint_options import CheckpointOptions
-from splatseg.tasks.fit_quality import fit_quality
-from splatseg.tasks.scene_parts import layer_of, mask_use, views_asked, views_recorded
-from splatseg.tasks.segment_options import SegmentOptions
-from splatseg.tasks.stopped_training import told_how_to_resume, training_checkpoints
+from splatseg.tasks.work import (
+    EVIDENCE_FOLDER,
+    SILENT,
+    Observer,
+    Work,
+    check_new_folder,
+    layer_versions,
+    view_spec,
+)
+
+
+@options_class
+class SegmentOptions:
+    """Options that all methods share."""
+
+    evidence: str | None = None
+    """Name of the evidence: a folder of the scene's or of its capture, such as labels_semantic.
+    None takes the only one there is."""
+
+    layer: str | None = None
+    """Name of the layer. None names it like the evidence."""
+
+    zero_is_class: bool = False
+    """The id 0 of the evidence's files is a class, not void: ids grow by 1, and the layer records
+    what they were."""
+
+    void: int | None = None
+    """A further id of the evidence's files that means void, such as 255."""
+
+    views: tuple[str, ...] = ("train",)
+    """Views to use: train, all, or names, separated by commas or spaces. Recorded in the layer."""
+
+    view_masks: Literal["auto", "ignore", "off"] = "auto"
+    """How the views' masks apply to label maps, panoptic segments and tracks. ignore: pixels where
+    the mask is 0 have no label, such as those of moving things. off: masks are not used. auto:
+    ignore where the fit ignored them too, else off."""
+
+    published: bool = False
+    """Use the method's published setting: the authors' options, and no completion."""
+
+    complete: bool = True
+    """Label Gaussians that no view explains from their neighbours; they are marked as inferred."""
+
+    classes: str | None = None
+    """With instances: name of a layer of classes to merge them with. Instances take their class
+    from it, and stuff classes become one segment each: the layer is panoptic."""
+
+    seed: int = 0
+    """Seed of random choices, recorded in the layer."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -120,7 +166,7 @@ def segment(
         checkpoints: How often a method that trains keeps its state in the scene's folder, and
             whether it goes on from there. What ends it early leaves a checkpoint; None keeps none.
         layers: Layers at hand; others are read from the scene's folder.
-        backend: Who renders.
+        backend: Rendering backend.
         observer: Is told of the progress.
 
     Raises:
@@ -128,76 +174,93 @@ def segment(
         ShapeError: If evidence does not have its photograph's proportions.
         KeyboardInterrupt: If it was interrupted; the message says how to go on.
     """
-    started = time.monotonic()
-    options = options or SegmentOptions()
+    work = Work(scene=scene, layers=layers, backend=backend, observer=observer)
     method = find_method(method) if isinstance(method, str) else method
+    return segment_work(
+        work,
+        method,
+        options or SegmentOptions(),
+        method_options=method_options,
+        completion=completion,
+        checkpoints=checkpoints,
+    )
+
+
+def segment_work(
+    work: Work,
+    method: Method,
+    options: SegmentOptions,
+    *,
+    method_options: Any = None,
+    completion: CompletionOptions | None = None,
+    checkpoints: CheckpointOptions | None = None,
+) -> Segmentation:
+    """`segment` of a scene that is open."""
+    began = time.monotonic()
+    scene = work.scene
     chosen = _method_options(method, method_options, options)
-    folder = refined_folder(method, chosen, checkpoints)
-    trained = trained_features(scene, method, chosen, layers)
+    folder = _refined_folder(method, chosen, checkpoints)
+    trained = trained_features(work, method, chosen)
     if trained is None:
-        chosen = with_companions(scene, method, chosen, observer)
-    evidence_name, evidence = _evidence(scene, method, options, trained)
-    merged = _classes_to_merge(scene, options, evidence, layers)
-    check_name("layer", name := options.layer or evidence_name)
-    views = _views(scene, evidence, options.views, observer)
-    masks = mask_use(scene) if options.view_masks == "auto" else options.view_masks
-    if masks == "ignore":
-        evidence, whole = without_masked(evidence, views), evidence
-        if evidence is not whole:
-            masked = sum(view.mask is not None for view in views)
-            observer.note(f"masks of {masked} of {len(views)} views leave pixels out")
+        chosen = with_companions(work, method, chosen)
+    name, evidence = evidence_to_lift(
+        work,
+        method,
+        options.evidence or (None if trained is None else trained.info.evidence),
+        zero_is_class=options.zero_is_class,
+        void=options.void,
+    )
+    merged = classes_to_merge(work, evidence, options.classes)
+    check_name("layer", layer_name := options.layer or name)
+    views = views_to_lift(work, evidence, options.views)
+    keeps_state = trained is None and folder is None
     inputs = MethodInputs(
         gaussians=scene.gaussians,
         views=views,
-        evidence=evidence,
+        evidence=unmasked(work, evidence, views, options.view_masks),
         prompt_views=scene.views,
-        companions=named_companions(scene, method, chosen),
-        models=named_models(method, chosen, report=observer.note),
+        companions=named_companions(work, method, chosen),
+        models=named_models(method, chosen, report=work.observer.note),
         trained=trained,
         classes=scene.classes,
         metres_per_unit=scene.metres_per_unit,
         up=scene.up,
-        backend=backend,
+        backend=work.backend,
         seed=options.seed,
-        checkpoints=(
-            training_checkpoints(scene, name, method, checkpoints, observer)
-            if trained is None and folder is None
-            else None
-        ),
+        checkpoints=training_checkpoints(work, layer_name, method, checkpoints)
+        if keeps_state
+        else None,
     )
-    timings = {"open": time.monotonic() - started}
-    warnings = _checked_fit(scene, backend, timings, observer)
-    with told_how_to_resume(inputs.checkpoints, observer):
-        made = _run(method, inputs, chosen, timings, observer)
-        refined = None
-        if isinstance(made, Refined):
-            refined = replace(scene, gaussians=made.gaussians)
-            scene, made = refined, made.layer
-        layer = made
-        if options.complete and method.complete and not options.published:
-            layer = _completed(scene, layer, completion, timings)
-        layer = _panoptic(scene, layer, merged, method)
-    layer = _described(layer, method, evidence_name, inputs, options)
-    found = _segmentation(layer, name, inputs, timings)
-    return replace(found, warnings=warnings, refined=refined, folder=folder)
-
-
-def _checked_fit(
-    scene: Scene, backend: BackendName, timings: dict[str, float], observer: Observer
-) -> tuple[str, ...]:
-    """Tell where the scene is too poor to carry labels, or cannot be held against photographs."""
+    timings = {"open": time.monotonic() - began}
     began = time.monotonic()
-    try:
-        quality = fit_quality(scene, backend=backend)
-    except InputError as error:
-        said = f"the scene was not held against its photographs: {str(error).rstrip('.')}"
-        observer.note(said)
-        return (f"{said}.",)
+    warnings = check_fit(work)
     timings["check fit"] = time.monotonic() - began
-    if quality is None or quality.warning is None:
-        return ()
-    observer.note(quality.warning)
-    return (f"{quality.warning}.",)
+    refined = None
+    with with_resume_hint(inputs.checkpoints, work.observer):
+        began = time.monotonic()
+        with work.observer.stage("segment") as step:
+            layer = method.run(replace(inputs, progress=step), chosen)
+        timings[method.name] = time.monotonic() - began
+        if isinstance(layer, Refined):
+            scene = refined = replace(scene, gaussians=layer.gaussians)
+            layer = layer.layer
+        if options.complete and method.complete and not options.published:
+            began = time.monotonic()
+            layer = _completed(scene, layer, completion)
+            timings["complete"] = time.monotonic() - began
+        if merged is not None:
+            layer = _panoptic(scene, layer, merged, method)
+    return Segmentation(
+        layer=_described(layer, method, name, inputs, options),
+        name=layer_name,
+        evidence=inputs.evidence,
+        views=views,
+        timings=timings,
+        refined=refined,
+        folder=folder,
+        warnings=warnings,
+        checkpoint=None if inputs.checkpoints is None else inputs.checkpoints.path,
+    )
 
 
 @boundary
@@ -210,41 +273,48 @@ def save_segmentation(made: Segmentation, root: Path) -> Path:
         The file of the layer.
     """
     if made.refined is not None and made.folder is not None:
-        return save_refined(
-            made.refined, made.layer, made.folder, made.name, evidence=made.evidence
-        )
+        record = {"layer": made.name, "method": made.layer.info.method}
+        scene = derived_scene(made.refined, "refined", record)
+        document = Document(scene=scene, layers={made.name: made.layer})
+        evidence = own_evidence(made.evidence, made.refined)
+        save_document(document, made.folder, evidence=evidence)
+        return made.folder / "layers" / f"{made.name}.npz"
     path = save_scene_layer(made.layer, root, made.name)
     if made.checkpoint is not None:
         discard_checkpoint_file(made.checkpoint)
     return path
 
 
-def _run(
-    method: Method,
-    inputs: MethodInputs,
-    options: Any,
-    timings: dict[str, float],
-    observer: Observer,
-) -> Layer | Refined:
-    """Run the method as the stage ``segment``."""
-    with observer.stage("segment") as step:
-        began = time.monotonic()
-        found = method.run(replace(inputs, progress=step), options)
-        timings[method.name] = time.monotonic() - began
-    return found
+def derived_scene(scene: Scene, how: str, record: Mapping[str, Any]) -> Scene:
+    """The scene as a new one without the edits of the one it was made of, which it records."""
+    provenance = {
+        key: value for key, value in scene.provenance.items() if key not in (HISTORY, BASE)
+    }
+    source = None if scene.root is None else scene.root.resolve().as_posix()
+    return replace(scene, provenance=provenance | {how: {"scene": source, **record}})
 
 
-def _segmentation(
-    layer: Layer, name: str, inputs: MethodInputs, timings: Mapping[str, float]
-) -> Segmentation:
-    return Segmentation(
-        layer=layer,
-        name=name,
-        evidence=inputs.evidence,
-        views=inputs.views,
-        timings=timings,
-        checkpoint=None if inputs.checkpoints is None else inputs.checkpoints.path,
-    )
+def own_evidence(evidence: Evidence, scene: Scene) -> tuple[Path, ...]:
+    """Evidence that lies in the scene's own folder, which a new scene could not find."""
+    if scene.root is None:
+        return ()
+    inside = evidence.folder.resolve().parent == (scene.root / EVIDENCE_FOLDER).resolve()
+    return (evidence.folder,) if inside else ()
+
+
+def _refined_folder(
+    method: Method, options: Any, checkpoints: CheckpointOptions | None
+) -> Path | None:
+    """The folder of the new scene that the method's options name, if they name one."""
+    folder: Path | None = None if method.refines is None else getattr(options, method.refines)
+    if folder is None:
+        return None
+    if checkpoints is not None and checkpoints.resume:
+        raise InputError(
+            f"resume: a training with {method.refines} keeps nothing to go on from; leave one out."
+        )
+    check_new_folder(folder)
+    return folder
 
 
 def _method_options(method: Method, given: Any, options: SegmentOptions) -> Any:
@@ -258,28 +328,19 @@ def _method_options(method: Method, given: Any, options: SegmentOptions) -> Any:
     return given
 
 
-def _completed(
-    scene: Scene,
-    layer: Layer,
-    completion: CompletionOptions | None,
-    timings: dict[str, float],
-) -> Layer:
+def _completed(scene: Scene, layer: Layer, completion: CompletionOptions | None) -> Layer:
     """The layer with labels for Gaussians that have none, where it is one of labels."""
     labels = layer.labels if isinstance(layer, InstanceTree) else layer
     if not isinstance(labels, Labels) or not bool((labels.ids != UNLABELLED).any()):
         return layer
-    began = time.monotonic()
     labels = complete(scene.gaussians, labels, options=completion)
-    timings["complete"] = time.monotonic() - began
     return replace(layer, labels=labels) if isinstance(layer, InstanceTree) else labels
 
 
 def _panoptic(
-    scene: Scene, layer: Layer, classes: tuple[Labels, ClassTable] | None, method: Method
+    scene: Scene, layer: Layer, classes: tuple[Labels, ClassTable], method: Method
 ) -> Layer:
-    """Instances merged with classes, where these are given."""
-    if classes is None:
-        return layer
+    """Instances merged with classes."""
     instances = layer.cut() if isinstance(layer, InstanceTree) else layer
     if not isinstance(instances, Labels):
         raise InputError(
@@ -289,88 +350,20 @@ def _panoptic(
 
 
 def _described(
-    layer: Layer,
-    method: Method,
-    evidence_name: str,
-    inputs: MethodInputs,
-    options: SegmentOptions,
+    layer: Layer, method: Method, evidence: str, inputs: MethodInputs, options: SegmentOptions
 ) -> Layer:
     """The layer with a record of what it was made from; a method's own record comes first."""
-    own = layer.info.views
+    views = layer.info.views
     info = replace(
         layer.info,
         method=layer.info.method or method.name,
-        evidence=evidence_name,
-        views=tuple(view.name for view in inputs.views) if own is None else own,
-        views_asked=views_recorded(options.views),
+        evidence=evidence,
+        views=tuple(view.name for view in inputs.views) if views is None else views,
+        views_asked=view_spec(options.views),
         seed=options.seed,
-        versions={
-            "splatseg": importlib.metadata.version("splatseg"),
-            "torch": str(torch.__version__),
-        },
+        versions=layer_versions(),
     )
     source_ids = inputs.evidence.source_ids
     if isinstance(layer, Labels) and source_ids is not None:
         info = replace(info, source_ids={id: source_ids[id] for id in layer.present.tolist()})
     return with_info(layer, info)
-
-
-def _classes_to_merge(
-    scene: Scene,
-    options: SegmentOptions,
-    evidence: Evidence,
-    layers: Mapping[str, Layer] | None,
-) -> tuple[Labels, ClassTable] | None:
-    """The layer of classes and what its ids mean."""
-    if options.classes is None:
-        return None
-    if evidence.kind == "labels":
-        raise InputError(f"classes: goes with evidence of instances, not of {evidence.kind}.")
-    layer = layer_of(scene, options.classes, layers)
-    if not isinstance(layer, Labels):
-        raise InputError(f"classes: expected a layer of labels, got {layer_kind(layer)}.")
-    table = evidence.classes or scene.classes
-    if isinstance(evidence, TrackedEvidence):
-        table = evidence.maps.table or scene.classes
-    if table is None:
-        raise InputError(
-            "classes: expected a table that says which classes are things, and neither the "
-            "capture nor the evidence has one."
-        )
-    return layer, table
-
-
-def _evidence(
-    scene: Scene, method: Method, options: SegmentOptions, trained: Features | None
-) -> tuple[str, Evidence]:
-    """The evidence asked for, or else that of what was trained before, or else the only one."""
-    asked = options.evidence or (None if trained is None else trained.info.evidence)
-    folder = find_evidence(scene.evidence_folders, asked)
-    evidence = open_evidence(folder, zero_is_class=options.zero_is_class, void=options.void)
-    method.check_evidence(evidence)
-    return folder.name, evidence
-
-
-def _views(
-    scene: Scene, evidence: Evidence, asked: Sequence[str], observer: Observer
-) -> tuple[View, ...]:
-    """The views asked for that have evidence; named ones must have it."""
-    allowed = views_asked(scene, asked)
-    check_map_sizes(evidence, allowed)
-    if asked[0] not in ("train", "all"):
-        return allowed
-    known = set(evidence.view_names)
-    views = tuple(view for view in allowed if view.name in known)
-    if not views:
-        raise InputError(
-            f"evidence: expected some of at least one of the {len(allowed)} views that "
-            f"{asked[0]} allows, got none."
-        )
-    lacking = [view for view in allowed if view.name not in known]
-    # Evidence of the train views alone is as it should be, whatever is allowed.
-    if any(view.split == "train" for view in lacking):
-        observer.note(
-            f"{len(lacking)} of {len(allowed)} views have no such evidence, the first is "
-            f"{lacking[0].name}"
-        )
-    return views

@@ -1,6 +1,5 @@
-"""Words become a selection."""
+"""Clicks and boxes that a promptable model turns into masks: SAM-based prompts."""
 
-import importlib.metadata
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -11,10 +10,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatseg.core import JSON, LayerInfo, PromptableMasks, Scene, Selection
-from splatseg.core.boundary import boundary, convert_fields
+from splatseg.core.boundary import boundary
 from splatseg.core.models import GroundedMasks, TextFeatures
+from splatseg.core.options import options
 from splatseg.errors import InputError
-from splatseg.io.evidence import Evidence, FeatureEvidence, find_evidence, open_evidence
+from splatseg.io.evidence import Evidence, FeatureEvidence
 from splatseg.methods.prompt import (
     PromptOptions,
     PromptSession,
@@ -22,21 +22,28 @@ from splatseg.methods.prompt import (
     selection_of,
 )
 from splatseg.prompting.pipeline import SceneIndex, SelectionContext, postprocess
-from splatseg.prompting.prompts import Solid, ViewPrompt
+from splatseg.prompting.prompts import (
+    Solid,
+    ViewPrompt,
+)
 from splatseg.prompting.seen import ViewCache
 from splatseg.render import BackendName
-from splatseg.tasks._observer import SILENT, Observer
-from splatseg.tasks._query_sources import feature_evidence, mask_name
-from splatseg.tasks._select_record import prompt_record
-from splatseg.tasks.select_options import SelectOptions
-from splatseg.tasks.select_session import Selected, check_base, combined, within
+from splatseg.tasks.select import Selected, check_base, combined, prompt_record, within
+from splatseg.tasks.sources import STEPS, SelectOptions, feature_evidence, mask_name
+from splatseg.tasks.work import SILENT, Observer, Work, layer_versions
+
+# Prompts as the record of a layer holds them.
+
+
+# Words become a selection.
+
 
 _KINDS = ("masks", "panoptic", "tracked")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@options
 class TextOptions:
-    """What words are answered by."""
+    """What answers words."""
 
     features: str | None = None
     """Evidence of features in the space of words, such as features_text. None takes the only one
@@ -46,11 +53,8 @@ class TextOptions:
     """Evidence of masks. None takes the only one."""
 
     prompt: PromptOptions = field(default_factory=PromptOptions)
-    """How words become masks, points and votes; its words, and its names of evidence and models,
-    are not looked at."""
-
-    def __post_init__(self) -> None:
-        convert_fields(self)
+    """How words become masks, points and votes; its words and its names of evidence and models are
+    ignored."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -91,11 +95,11 @@ def select_text(
         scene: The scene; it stays as it is.
         words: Words or phrases, all of which are selected together.
         options: What answers, and how.
-        select_options: The mode, the seed, and the steps that follow.
+        select_options: The mode, the seed, and the post-processing.
         models: Models that answer instead of what was recorded.
         places: Bound the answer: of several, all hold.
         base: A selection that the mode adds to, subtracts from or intersects with.
-        backend: Who renders.
+        backend: Rendering backend.
         observer: Is told of the progress.
 
     Raises:
@@ -109,7 +113,8 @@ def select_text(
     asked = replace(options.prompt, words=tuple(words), point=())
     if not scene.train_views:
         raise InputError("views: expected train views to look for words in, the scene has none.")
-    features, masks = _evidence(scene, options, models)
+    work = Work(scene=scene, backend=backend, observer=observer)
+    features, masks = _evidence(work, options, models)
     session = PromptSession(
         scene.gaussians,
         scene.train_views,
@@ -130,7 +135,7 @@ def select_text(
         made = session.ask(words, progress=step)
     seconds |= made.seconds
     found = selection_of(made, session, asked)
-    confidence, steps = _cleaned(scene, made.confidence, chosen, backend)
+    confidence, steps = _cleaned(work, made.confidence, chosen)
     confidence = within(confidence, places, scene.gaussians)
     selection = combined(Selection.of_confidence(confidence), base, chosen.mode)
     evidence = None if features is None else features.folder.name
@@ -143,7 +148,7 @@ def select_text(
 
 
 def _evidence(
-    scene: Scene, options: TextOptions, models: TextModels
+    work: Work, options: TextOptions, models: TextModels
 ) -> tuple[FeatureEvidence | None, Evidence | None]:
     """What was recorded and is needed.
 
@@ -152,31 +157,35 @@ def _evidence(
     """
     features = None
     if models.grounder is None:
-        features = feature_evidence(scene, options.features, models.encoder)
+        features = feature_evidence(work, options.features, models.encoder)
     if models.grounder is not None and models.prompter is not None and options.evidence is None:
         return features, None
-    name = mask_name(scene, options.evidence, option="evidence")
+    name = mask_name(work, options.evidence, option="evidence")
     if name is None:
         return features, None
-    masks = open_evidence(find_evidence(scene.evidence_folders, name))
+    masks = work.evidence(name)
     if masks.kind not in _KINDS:
         raise InputError(f"evidence: expected masks or segments, {name!r} has {masks.kind}.")
     return features, masks
 
 
 def _cleaned(
-    scene: Scene, confidence: Tensor, options: SelectOptions, backend: BackendName
+    work: Work, confidence: Tensor, options: SelectOptions
 ) -> tuple[Float[Tensor, "n"], Mapping[str, float]]:
     """Without specks and holes, as the selections of clicks are."""
-    with ViewCache(scene.gaussians, backend=backend) as views:
+    with ViewCache(work.gaussians, backend=work.backend) as views:
         context = SelectionContext(
-            gaussians=scene.gaussians,
+            gaussians=work.gaussians,
             prompts=(),
             views=views,
-            neighbours=SceneIndex(scene.gaussians),
+            neighbours=SceneIndex(work.gaussians),
             source="text",
         )
-        return postprocess(confidence, context, enabled=options.steps)
+        return postprocess(
+            confidence,
+            context,
+            enabled=STEPS["none" if options.post_processing == "none" else "full"],
+        )
 
 
 def _info(
@@ -197,10 +206,7 @@ def _info(
         found.info,
         evidence=evidence,
         seed=options.seed,
-        versions={
-            "splatseg": importlib.metadata.version("splatseg"),
-            "torch": str(torch.__version__),
-        },
+        versions=layer_versions(),
         details=details,
     )
 
@@ -228,3 +234,6 @@ def text_prompts(selection: Selection, scene: Scene) -> tuple[ViewPrompt, ...]:
         for name, points in sorted(found.items())
         if points
     )
+
+
+# What is written of a selection beside its layer: splats of it alone, and pictures.

@@ -1,5 +1,6 @@
 """A new scene whose Gaussians belong to one side each of a layer's boundaries."""
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -7,20 +8,22 @@ import torch
 
 from splatseg.core import (
     UNLABELLED,
-    Gaussians,
     InstanceTree,
     Labels,
     LabelSource,
     Layer,
+    Renderable,
     Scene,
     View,
     layer_address,
 )
-from splatseg.core.boundary import boundary, convert_fields
+from splatseg.core.boundary import boundary
+from splatseg.core.options import Natural
+from splatseg.core.options import options as options_class
 from splatseg.edit import Document, save_document
-from splatseg.edit.document import BASE, HISTORY
 from splatseg.errors import InputError
 from splatseg.evaluate import psnr, render_and_photograph
+from splatseg.evaluate.photographs import MaskUse
 from splatseg.fit import (
     EXPOSURES,
     FitOptions,
@@ -46,34 +49,35 @@ from splatseg.lift import (
 from splatseg.methods import keeps_boundaries
 from splatseg.render import BackendName
 from splatseg.selection import layer_called
-from splatseg.tasks._observer import SILENT, Observer
-from splatseg.tasks._refined_scene import own_evidence
-from splatseg.tasks.new_scene import check_new_folder
-from splatseg.tasks.scene_parts import mask_use, views_that_made
+from splatseg.tasks.segment import derived_scene, own_evidence
+from splatseg.tasks.work import (
+    SILENT,
+    Observer,
+    Work,
+    check_new_folder,
+    mask_use,
+    photographed,
+    views_that_made,
+)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@options_class
 class SharpenSceneOptions:
     """What is sharpened by what, and how it is measured."""
 
     layer: str
-    """The layer whose boundaries count: labels."""
+    """The layer of labels whose boundaries count."""
 
     evidence: str | None = None
-    """Name of the evidence that tells where boundaries are. None takes what the layer was made
-    from. Segments with ids of each view's own take those of the layer that they fit best."""
+    """Name of the evidence that says where boundaries are. None takes what the layer was made from.
+    Segments with ids of each view take those of the layer that they overlap most."""
 
-    measure: int = 8
-    """Held-out views in which renders are compared with photographs before and after; 0 for
-    none."""
+    measure: Natural = 8
+    """Number of held-out views in which renders are compared with photographs before and after; 0
+    for none."""
 
     seed: int = 0
     """Seed of the order of views and of random codes."""
-
-    def __post_init__(self) -> None:
-        convert_fields(self)
-        if self.measure < 0:
-            raise InputError(f"measure: expected 0 or more, got {self.measure}.")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -115,7 +119,7 @@ def sharpen_scene(
         options: The layer, the evidence, and what is measured.
         sharpen_options: How long, and how much labels count.
         confusion: How the evidence errs; None decides labels by plain majority.
-        backend: Who renders.
+        backend: Rendering backend.
         observer: Is told of the progress.
 
     Raises:
@@ -124,10 +128,13 @@ def sharpen_scene(
     check_new_folder(folder)
     how = sharpen_options or SharpenOptions()
     scene = document.scene
-    layer = _layer(document, options.layer)
-    evidence, source, views = _source(scene, layer, options, backend)
+    work = Work(scene=scene, backend=backend, observer=observer)
+    layer = layer_called(document.layers, options.layer)
+    if not isinstance(layer, Labels):
+        raise InputError(f"layer: expected labels, {options.layer} is a selection or features.")
+    evidence, source, views = _source(work, layer, options)
     spaced = _spaced(scene, options.measure)
-    before = _psnr(scene, scene.gaussians, spaced, backend)
+    before = mean_psnr(work.field(), spaced, masks=mask_use(scene))
     with observer.stage("sharpen") as step:
         found = sharpen(
             scene.gaussians,
@@ -141,7 +148,8 @@ def sharpen_scene(
             backend=backend,
             progress=step,
         )
-    after = _psnr(scene, found.gaussians, spaced, backend)
+    sharpened = GaussianField(found.gaussians, backend=backend)
+    after = mean_psnr(sharpened, spaced, masks=mask_use(scene))
     layers = {**document.layers, **_sharpened(document, options.layer, merged(layer, found))}
     new = _sharpened_scene(scene, options, how, found, psnr=[before, after])
     document = Document(scene=new, layers=layers)
@@ -214,21 +222,19 @@ def _sharpened_scene(
     psnr: list[float | None],
 ) -> Scene:
     """The scene with new Gaussians, and how they were made."""
-    provenance = {
-        key: value for key, value in scene.provenance.items() if key not in (HISTORY, BASE)
-    }
-    provenance["sharpened"] = {
-        "scene": None if scene.root is None else scene.root.resolve().as_posix(),
+    record = {
         "layer": options.layer,
         "options": asdict(how),
         "seed": options.seed,
         "agreement": list(found.agreement),
         "psnr": psnr,
     }
+    new = derived_scene(scene, "sharpened", record)
+    provenance = dict(new.provenance)
     if found.exposures:
         exposures = recorded_exposures(scene.provenance) | dict(found.exposures)
         provenance[EXPOSURES] = exposures_record(exposures)
-    return replace(scene, gaussians=found.gaussians, provenance=provenance)
+    return replace(new, gaussians=found.gaussians, provenance=provenance)
 
 
 def _sharpened(document: Document, address: str, labels: Labels) -> dict[str, Layer]:
@@ -240,17 +246,11 @@ def _sharpened(document: Document, address: str, labels: Labels) -> dict[str, La
     return {name: labels}
 
 
-def _layer(document: Document, name: str) -> Labels:
-    layer = layer_called(document.layers, name)
-    if not isinstance(layer, Labels):
-        raise InputError(f"layer: expected labels, {name} is a selection or features.")
-    return layer
-
-
 def _source(
-    scene: Scene, layer: Labels, options: SharpenSceneOptions, backend: BackendName
+    work: Work, layer: Labels, options: SharpenSceneOptions
 ) -> tuple[Evidence, LabelSource, tuple[View, ...]]:
     """The evidence, label maps of it with the layer's ids, and the views to learn from."""
+    scene = work.scene
     name = options.evidence or layer.info.evidence
     if name is None:
         raise InputError(
@@ -275,28 +275,22 @@ def _source(
         views=views,
         source=EvidenceSegments(evidence=evidence),
         labels=layer,
-        backend=backend,
+        backend=work.backend,
     )
     return evidence, matched, views
 
 
 def _spaced(scene: Scene, most: int) -> tuple[View, ...]:
     """Some held-out views, or training views where there are none."""
-    pool = [view for view in scene.test_views or scene.train_views if view.image is not None]
-    pool = [view for view in pool if view.image is not None and view.image.is_file()]
+    pool = photographed(scene.test_views or scene.train_views)
     if not pool or not most:
         return ()
     return tuple(pool[:: -(-len(pool) // most)])
 
 
-def _psnr(
-    scene: Scene, gaussians: Gaussians, views: tuple[View, ...], backend: str
-) -> float | None:
+def mean_psnr(field: Renderable, views: Sequence[View], *, masks: MaskUse = "off") -> float | None:
+    """Mean PSNR of renders against photographs, dB; None without views."""
     if not views:
         return None
-    masks = mask_use(scene)
-    scores = [
-        psnr(*render_and_photograph(GaussianField(gaussians, backend=backend), view, masks=masks))
-        for view in views
-    ]
+    scores = [psnr(*render_and_photograph(field, view, masks=masks)) for view in views]
     return sum(scores) / len(scores)

@@ -3,10 +3,12 @@
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 import torch
+from splatseg.tasks._select_sources import Offer
 
 from splatseg.core import (
     Features,
@@ -26,8 +28,7 @@ from splatseg.lift import GaussianField
 from splatseg.lift.affinity import AffinityHead
 from splatseg.methods import Method, MethodInputs, _registry, register_method
 from splatseg.methods.uplift import UpliftMethodOptions
-from splatseg.tasks import select_session
-from splatseg.tasks._select_sources import Offer, OpenedSource, open_source
+from splatseg.tasks.sources import OpenedSource, open_source
 from splatseg_bench.answers import BySelection, stroke_prompt
 from splatseg_bench.layouts import read_benchmark
 from splatseg_bench.options import BenchOptions
@@ -152,7 +153,7 @@ def test_features_trained_as_published_answer_as_published(
         asked.append((found.rule, found.published))
         return found
 
-    monkeypatch.setattr(select_session, "open_source", opened)
+    monkeypatch.setattr(import_module("splatseg.tasks.select"), "open_source", opened)
     for layer in (affinity, published):
         assert run(protocol, layer).methods[0].scores["iou"] > 0.3
     assert asked == [("fixed", False), ("adaptive", True)]

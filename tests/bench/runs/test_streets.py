@@ -18,7 +18,7 @@ from splatseg.evaluate import Confusion, semantic_score
 from splatseg.io.scene import load_scene, save_scene
 from splatseg.methods import Method, register_method, uplift
 from splatseg.methods import _registry as registry
-from splatseg.tasks.scene_parts import scene_field
+from splatseg.tasks.work import scene_field
 from splatseg_bench.layouts import read_benchmark
 from splatseg_bench.options import BenchOptions
 from splatseg_bench.protocols import TABLE_1, find_protocol, merged_name

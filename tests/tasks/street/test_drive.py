@@ -30,8 +30,8 @@ from splatseg.tasks import (
     open_drive,
     street_field,
 )
-from splatseg.tasks.scene_parts import scene_field
-from splatseg.tasks.street.drive import street_drive
+from splatseg.tasks.street_drive import street_drive
+from splatseg.tasks.work import Work, scene_field
 from support.arrays import arrays_of
 from support.observers import Stopping
 
@@ -318,7 +318,7 @@ def test_a_name_of_the_other_form_is_refused_or_replaced(filled, options) -> Non
         with pytest.raises(InputError, match=taken):
             make_street_field(scene, options=asked, field_options=QUICK)
     with pytest.raises(InputError, match=taken):
-        street_drive(scene, options=options, field_options=QUICK)
+        street_drive(Work(scene=scene), options, QUICK, overwrite=False)
     make_street_field(scene, options=options, field_options=QUICK, overwrite=True)
     assert [path.name for path in (root / "fields").iterdir()] == ["street"]
     assert isinstance(scene_field(scene, "street"), DriveField)
@@ -352,9 +352,12 @@ def test_a_broken_table_is_one_sentence(filled, options) -> None:
 @pytest.mark.parametrize(
     ("values", "words"),
     [
-        ({"block_length": 10, "block_overlap": 10}, "^block_overlap: expected less than a block"),
-        ({"block_length": 0}, "^block_length: expected a positive number of metres, got 0"),
-        ({"block_length": 9, "block_overlap": -1}, "^block_overlap: expected a positive number"),
+        (
+            {"block_length": 10, "block_overlap": 10},
+            "^block_overlap: expected less than 10 m",
+        ),
+        ({"block_length": 0}, "^block_length: expected more than 0, got 0"),
+        ({"block_length": 9, "block_overlap": -1}, "^block_overlap: expected more than 0"),
         ({"block_overlap": 5}, "^block_overlap: expected a length of blocks with it, got 5 m"),
     ],
 )
@@ -385,7 +388,7 @@ def test_blocks_that_nothing_is_known_of_are_refused(scene, options, tmp_path) -
         street_field(scene, options=options)
     whole = replace(options, block_length=None, block_overlap=None)
     with pytest.raises(InputError, match="^block_length: expected the length of blocks"):
-        street_drive(scene, options=whole)
-    for make in (make_street_field, street_drive):
+        street_drive(Work(scene=scene), whole, None, overwrite=False)
+    for make in (make_street_field,):
         with pytest.raises(InputError, match="^scene: expected one with a folder"):
             make(replace(scene, root=None), options=options)

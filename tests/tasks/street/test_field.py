@@ -24,13 +24,16 @@ from splatseg.tasks import (
     save_street_field,
     street_field,
 )
-from splatseg.tasks._observer import SILENT, Observer
-from splatseg.tasks.scene_parts import scene_field
-from splatseg.tasks.street._inputs import drive_inputs
-from splatseg.tasks.street._sources import drive_sources
+from splatseg.tasks.street_inputs import DriveSources, drive_sources
+from splatseg.tasks.work import SILENT, Observer, Work, scene_field
 
 QUICK = DnmpOptions(voxels=(2.0, 4.0), geometry_iterations=1, iterations=3, rays=64)
 EVIDENCE = StreetOptions(evidence="labels_semantic")
+
+
+def sources_of(scene: Scene, views, **asked) -> DriveSources:
+    """The sources of an open scene."""
+    return drive_sources(Work(scene=scene, backend="cpu"), views, **asked)
 
 
 @pytest.fixture(scope="module")
@@ -117,17 +120,23 @@ def test_the_same_seed_gives_the_same_field_and_another_another(
 def test_depth_comes_from_what_is_there(drive, generated_drive) -> None:
     scans = read_scans(generated_drive)
     views = drive.train_views[:2]
-    asked = {"cell": 0.5, "backend": "cpu"}
+    asked = {"cell": 0.5}
     some = torch.rand(200, 3, generator=torch.Generator().manual_seed(1)) * 8
     full = replace(drive, gaussians=sparse_gaussians(scans))
     bare = tuple(replace(view, depth=None, depth_unit=None) for view in views)
     found = {
-        "scans": drive_sources(drive, bare, depth="auto", scans=scans, points=some, **asked),
-        "scans, and of the Gaussians where no laser looked": drive_sources(
-            full, bare, depth="auto", scans=scans, points=some, **asked
+        "scans": drive_sources(
+            Work(scene=drive, backend="cpu"), bare, depth="auto", scans=scans, points=some, **asked
         ),
-        "the Gaussians": drive_sources(full, bare, depth="auto", scans=None, points=some, **asked),
-        "points": drive_sources(drive, bare, depth="auto", scans=None, points=some, **asked),
+        "scans, and of the Gaussians where no laser looked": drive_sources(
+            Work(scene=full, backend="cpu"), bare, depth="auto", scans=scans, points=some, **asked
+        ),
+        "the Gaussians": drive_sources(
+            Work(scene=full, backend="cpu"), bare, depth="auto", scans=None, points=some, **asked
+        ),
+        "points": drive_sources(
+            Work(scene=drive, backend="cpu"), bare, depth="auto", scans=None, points=some, **asked
+        ),
     }
     known: dict[str, list[torch.Tensor]] = {}
     for kind, sources in found.items():
@@ -142,7 +151,9 @@ def test_depth_comes_from_what_is_there(drive, generated_drive) -> None:
     for one, filled, other in zip(measured, both, shown, strict=True):
         assert torch.equal(filled, torch.where(one > 0, one, other))
     assert any(not torch.equal(one, filled) for one, filled in zip(measured, both, strict=True))
-    centres = drive_sources(full, bare, depth="points", scans=None, points=None, **asked)
+    centres = drive_sources(
+        Work(scene=full, backend="cpu"), bare, depth="points", scans=None, points=None, **asked
+    )
     assert "centres of Gaussians" in centres.said
     for kind, words in {
         "scans": "expected scans to be given",
@@ -153,9 +164,13 @@ def test_depth_comes_from_what_is_there(drive, generated_drive) -> None:
         "nothing": "expected one of those at hand .*got 'nothing'",
     }.items():
         with pytest.raises(InputError, match=f"^depth: .*{words}"):
-            drive_sources(drive, bare, depth=kind, scans=None, points=some, **asked)
+            drive_sources(
+                Work(scene=drive, backend="cpu"), bare, depth=kind, scans=None, points=some, **asked
+            )
     with pytest.raises(InputError, match="^points: expected points to put primitives at"):
-        drive_sources(drive, bare, depth="points", scans=None, points=None, **asked)
+        drive_sources(
+            Work(scene=drive, backend="cpu"), bare, depth="points", scans=None, points=None, **asked
+        )
 
 
 def test_maps_of_the_capture_give_depth_and_points(drive, tmp_path) -> None:
@@ -164,7 +179,7 @@ def test_maps_of_the_capture_give_depth_and_points(drive, tmp_path) -> None:
     Image.fromarray(steps).save(tmp_path / "a.png")
     mapped = replace(view, depth=tmp_path / "a.png", depth_unit=0.001)
     sources = drive_sources(
-        drive, [mapped], depth="auto", scans=None, points=None, cell=0.5, backend="cpu"
+        Work(scene=drive, backend="cpu"), [mapped], depth="auto", scans=None, points=None, cell=0.5
     )
     assert sources.said.endswith("depth maps of the capture")
     assert "points of depth" in sources.said

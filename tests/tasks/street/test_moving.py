@@ -21,14 +21,23 @@ from splatseg.io.scans import read_scans
 from splatseg.street.build import DnmpOptions
 from splatseg.street.depth_views import DepthView
 from splatseg.tasks import StreetDrive, StreetOptions, make_street_field, open_drive, street_field
-from splatseg.tasks.street._inputs import drive_inputs
-from splatseg.tasks.street._masks import masked_depths, masked_depths_of
-from splatseg.tasks.street._sources import drive_sources
+from splatseg.tasks.street_inputs import (
+    drive_inputs,
+    drive_sources,
+    masked_depths,
+    masked_depths_of,
+)
+from splatseg.tasks.work import Work
 from support.observers import Stopping
 
 LAYER = "labels_semantic"
 QUICK = DnmpOptions(voxels=(2.0,), geometry_iterations=1, iterations=2, rays=64)
 MARGIN = 0.1
+
+
+def opened(scene: Scene) -> Work:
+    """The scene, told about to one who may stop."""
+    return Work(scene=scene, backend="cpu", observer=Stopping())
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +71,7 @@ def test_boxes_of_their_moment_are_left_out_of_views(scene, generated_drive, tmp
     number = float(first.name[-4:])
     box = ahead(first, 6.0, start=number, end=number)
     options = asked(generated_drive, moving=written([box], tmp_path), moving_clock="frames")
-    with drive_inputs(scene, options, Stopping()) as inputs:
+    with drive_inputs(opened(scene), options) as inputs:
         masks = {view.name: load_mask(view) for view in inputs.views}
         folder = next(view.mask for view in inputs.views if view.mask is not None).parent
         assert inputs.moving is not None
@@ -96,7 +105,7 @@ def test_the_clock_is_that_of_the_capture_unless_frames_are_asked_for(
     options = StreetOptions(evidence=LAYER, moving=written(boxes, tmp_path))
     found = {}
     for clock in ("recorded", "frames"):
-        with drive_inputs(scene, replace(options, moving_clock=clock), Stopping()) as inputs:
+        with drive_inputs(opened(scene), replace(options, moving_clock=clock)) as inputs:
             found[clock] = [view.name for view in inputs.views if view.mask is not None]
     assert found == {"recorded": [first.name], "frames": [second.name]}
 
@@ -111,7 +120,7 @@ def test_scans_lose_their_points_in_boxes(scene, generated_drive, tmp_path) -> N
     inside = inside_boxes(scan.points, [box], margin=MARGIN)
     assert int(inside.sum()) > 3
     options = asked(generated_drive, moving=written([box], tmp_path))
-    with drive_inputs(scene, options, Stopping()) as inputs:
+    with drive_inputs(opened(scene), options) as inputs:
         assert inputs.scans is not None
         assert torch.equal(inputs.scans.scan("0001").points, scan.points[~inside])
         assert len(inputs.scans.scan("0000")) == len(whole.scan("0000"))
@@ -120,7 +129,7 @@ def test_scans_lose_their_points_in_boxes(scene, generated_drive, tmp_path) -> N
 def test_classes_are_left_out_of_views(scene, generated_drive) -> None:
     evidence = open_evidence(generated_drive / LAYER)
     sky = evidence.classes.by_name("sky").id
-    with drive_inputs(scene, asked(generated_drive, moving_classes=("sky",)), Stopping()) as inputs:
+    with drive_inputs(opened(scene), asked(generated_drive, moving_classes=("sky",))) as inputs:
         for view in inputs.views:
             shown = evidence.label_map(view.name).ids == sky
             mask = load_mask(view)
@@ -134,7 +143,7 @@ def test_classes_are_left_out_of_views(scene, generated_drive) -> None:
 def test_views_that_are_learned_from_lose_them_whatever_their_split(scene, generated_drive) -> None:
     options = asked(generated_drive, moving_classes=("sky",), views=("all",))
     novel = next(view.name for view in scene.views if view.split == "test_novel")
-    with drive_inputs(scene, options, Stopping()) as inputs:
+    with drive_inputs(opened(scene), options) as inputs:
         assert inputs.moving.of == len(scene.views)
         found = next(view for view in inputs.views if view.name == novel)
     assert found.split == "test_novel"
@@ -226,7 +235,7 @@ def test_every_source_of_depth_is_masked(scene, generated_drive, tmp_path) -> No
     cloud = torch.cat([scans.scan(name).points for name in scans.scan_names])
     for kind in ("maps", "depth_model", "scans", "points"):
         (found,) = drive_sources(
-            rooted, [masked], depth=kind, scans=scans, points=cloud, cell=0.5, backend="cpu"
+            opened(rooted), [masked], depth=kind, scans=scans, points=cloud, cell=0.5
         ).depths()
         half = found.depth.shape[1] // 2
         assert not bool(found.depth[:, :half].any()), kind

@@ -19,9 +19,14 @@ from splatseg.street.build import DnmpOptions
 from splatseg.street.depth_views import DepthView
 from splatseg.street.field import MeshField
 from splatseg.tasks import ScanLabelOptions, StreetOptions, label_scans, open_drive, street_field
-from splatseg.tasks.street._depths import KeptDepths, depth_errors, spread_views
-from splatseg.tasks.street.point_scores import in_sight, point_scores, true_ids
-from splatseg.tasks.street.report import LabelledScans, report_street
+from splatseg.tasks.street_field import KeptDepths, depth_errors, spread_views
+from splatseg.tasks.street_report import (
+    LabelledScans,
+    in_sight,
+    point_scores,
+    report_street,
+    true_ids,
+)
 from support.analytic import BallOverFloor
 from support.mesh_fields import balls, told_field
 

@@ -33,7 +33,7 @@ from splatseg.pose._photographs import LeftOut
 from splatseg.pose._saved import Lens, MapperTry, PoseReport
 from splatseg.street.blocks import DriveBlockOptions, cut_drive
 from splatseg.street.files import load_drive, load_mesh_field, save_drive, save_mesh_field
-from splatseg.tasks._figures import read_points, read_scores
+from splatseg.tasks.figures import read_points
 from support.fuzz.targets.base import (
     Target,
     gaussians,
@@ -226,10 +226,3 @@ def moving(folder: Path) -> Target:
     box = {"centre": [0, 1.5, 2], "size": [4, 2, 1.5], "rotation": [1, 0, 0, 0]}
     rows = [box | {"start": 1, "end": 2.5, "name": "car 3"}, box | {"time": 7}]
     return whole(folder / "moving.json", json.dumps({"boxes": rows}).encode(), read_moving)
-
-
-@target("scores.json")
-def scores(folder: Path) -> Target:
-    """Scores of instances."""
-    content = json.dumps({"1": 0.5, "2": 1, "17": 0.25}).encode()
-    return whole(folder / "a.json", content, read_scores)

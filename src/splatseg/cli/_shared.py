@@ -1,0 +1,445 @@
+"""What commands share: flags, progress on stderr, and how a result is printed."""
+
+import json
+import shlex
+import sys
+import time
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
+
+import tyro
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.text import Text
+from typing_extensions import override
+
+from splatseg.cli._streams import tell
+from splatseg.core import Scene
+from splatseg.errors import visible
+from splatseg.io.scene import load_scene
+from splatseg.io.splats import Values
+from splatseg.render import BackendName
+from splatseg.tasks import Observer
+
+if TYPE_CHECKING:
+    from splatseg.fit import FitProgress
+    from splatseg.pose import PoseProgress
+
+
+def _flag(metavar: str | None, help: str, *aliases: str) -> Any:
+    return tyro.conf.arg(metavar=metavar, help=help, aliases=aliases or None)
+
+
+SceneFolder: TypeAlias = Annotated[Path, tyro.conf.Positional, _flag("SCENE", "The scene folder.")]
+
+NewScene: TypeAlias = Annotated[
+    Path, _flag("NEW", "Scene folder to write. It must not exist yet.", "-o")
+]
+
+MadeSceneFolder: TypeAlias = Annotated[
+    Path,
+    _flag(
+        "SCENE", "Scene folder to write. An existing scene is replaced unless it has layers.", "-o"
+    ),
+]
+
+Data: TypeAlias = Annotated[
+    Path | None,
+    _flag(
+        "CAPTURE",
+        "Folder of the capture, if it was moved. Needed only to read photographs or evidence of "
+        "the capture.",
+    ),
+]
+
+Backend: TypeAlias = Annotated[
+    BackendName,
+    _flag(
+        None,
+        "Rendering backend: cpu, the C++ kernels; cuda; reference, slow and plain Python. auto: "
+        "cuda for Gaussians on a GPU, else cpu.",
+    ),
+]
+
+Field: TypeAlias = Annotated[
+    str | None,
+    _flag("NAME", "Field of the scene, made by street, instead of the Gaussians and their layers."),
+]
+
+Seed: TypeAlias = Annotated[int, _flag("N", "Seed of all random choices.")]
+
+Format: TypeAlias = Annotated[
+    str,
+    _flag(
+        "NAME",
+        "Layout of the capture: auto, nerfstudio, blender, colmap, llff, idr, replica, scannet, "
+        "scannetpp, kitti360 or waymo. auto takes the first of these that is found.",
+    ),
+]
+
+Strict: TypeAlias = Annotated[
+    bool,
+    _flag(
+        None,
+        "Refuse a splat file with Gaussians that cannot be rendered (NaN, infinite), and a capture "
+        "with photographs that are missing, unreadable, of another shape than their intrinsics or "
+        "mask or with an impossible pose, or with start points that are not finite. Without it "
+        "they are left out and counted or named, as long as a Gaussian and half of the photographs "
+        "remain.",
+    ),
+]
+
+Linear: TypeAlias = Annotated[
+    tuple[Values, ...],
+    _flag(
+        "VALUES",
+        "Values of a PLY file that are stored as they are, where 3DGS stores logs and logits: "
+        "scales, opacities.",
+    ),
+]
+
+Overwrite: TypeAlias = Annotated[
+    bool, _flag(None, "Replace what an earlier run wrote under the same name.")
+]
+
+Split: TypeAlias = Annotated[
+    str, _flag("SPLIT", "Views: test, train, another split of the scene, or all.")
+]
+
+SplitOrPath: TypeAlias = Annotated[
+    str,
+    _flag(
+        "SPLIT",
+        "Views: test, train, another split of the scene, all, or path: a smooth path near the "
+        "training cameras.",
+    ),
+]
+
+Frames: TypeAlias = Annotated[int, _flag("N", "Number of views of a path.")]
+
+Json: TypeAlias = Annotated[
+    bool, _flag(None, "Print the result as one JSON object, and nothing else, to stdout.")
+]
+
+Quiet: TypeAlias = Annotated[
+    bool, _flag(None, "Show no progress and no notes; results and errors are still printed.")
+]
+
+Downloads: TypeAlias = Annotated[
+    bool, _flag(None, "Download missing weights; their names and sizes are printed first.")
+]
+
+Device: TypeAlias = Annotated[
+    str, _flag("NAME", "Device of the models: cpu, cuda, cuda:1. auto takes cuda if available.")
+]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Printing:
+    """A command that prints a result, and the progress of its work."""
+
+    json: Json = False
+    quiet: Quiet = False
+
+    @property
+    def observer(self) -> "ConsoleObserver":
+        """Shows the progress."""
+        return ConsoleObserver(quiet=self.quiet, json=self.json)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OnScene(Printing):
+    """A command that works on a scene."""
+
+    scene: SceneFolder
+    backend: Backend = "auto"
+    data: Data = None
+
+    def open(self) -> Scene:
+        """The scene."""
+        return load_scene(self.scene, data=self.data)
+
+
+SECONDS_BETWEEN_LINES = 10.0
+"""At most one line in this time: enough to see that something goes on, few enough for a log."""
+
+
+class ProgressLines:
+    """Writes how far some work is, where a bar cannot be redrawn.
+
+    The first line comes when the work has taken as long as there is between two lines, so that
+    short work writes none.
+
+    Args:
+        what: The work, in a word or two; each line begins with it.
+        write: Called with each line, its line feed included.
+        clock: Gives seconds.
+    """
+
+    def __init__(
+        self,
+        what: str,
+        *,
+        write: Callable[[str], object],
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._what = what
+        self._write = write
+        self._clock = clock
+        self._begin = self._last = clock()
+        self._first: float | None = None
+
+    def show(
+        self,
+        done: float,
+        total: float | None,
+        *,
+        text: str | None = None,
+        seconds_left: float | None = None,
+    ) -> None:
+        """Take note of how far the work is; a line is written if it is time.
+
+        Args:
+            done: How much is done.
+            total: Of how much; None where that is not known.
+            text: What is done, in words; None is ``DONE of TOTAL``.
+            seconds_left: Estimate; None goes by the speed since the first call.
+        """
+        if self._first is None:
+            self._first = done
+        now = self._clock()
+        if now - self._last < SECONDS_BETWEEN_LINES:
+            return
+        self._last = now
+        elapsed = now - self._begin
+        if text is None:
+            text = f"{done:g}" if total is None else f"{done:g} of {total:g}"
+        parts = [text]
+        if total:
+            parts.append(f"{100 * done / total:.0f} %")
+            if seconds_left is None and done > self._first:
+                seconds_left = elapsed * (total - done) / (done - self._first)
+        parts.append(f"{_clock_time(elapsed)} elapsed")
+        if seconds_left is not None:
+            parts.append(f"about {_clock_time(seconds_left)} left")
+        self._write(f"{self._what}: {', '.join(parts)}\n")
+
+
+def _clock_time(seconds: float) -> str:
+    """Minutes and seconds, with hours where there are some: 0:07, 12:30, 1:02:03."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+def lines_on_stderr(what: str) -> ProgressLines | None:
+    """Plain lines where stderr is no terminal; None where it is one, which shows a bar."""
+    if Console(stderr=True).is_terminal:
+        return None
+
+    return ProgressLines(what, write=lambda line: tell(sys.stderr, line))
+
+
+@contextmanager
+def progress(what: str, *, quiet: bool = False) -> Generator[Callable[[int, int], None]]:
+    """Progress of some work on stderr, with an estimate; gives a function of (done, total).
+
+    Args:
+        what: The work, in a word or two.
+        quiet: Show nothing at all.
+    """
+    if quiet:
+        yield lambda done, total: None
+        return
+    lines = lines_on_stderr(what)
+    if lines is not None:
+        yield lines.show
+        return
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(compact=True),
+    )
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(what, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+@contextmanager
+def _worded_bar(what: str, *more: ProgressColumn) -> Generator[tuple[Progress, TaskID]]:
+    """A bar of some work beside words on how far it is."""
+    columns = (TextColumn(what), BarColumn(bar_width=24), *more)
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        yield bar, bar.add_task("", total=None, left="")
+
+
+# Weight of the newest view in the figures of the progress line; views differ much.
+_SMOOTHING = 0.02
+
+
+class _Smoothed:
+    """Loss and PSNR of single views, smoothed over many of them."""
+
+    def __init__(self) -> None:
+        self._values: tuple[float, float] | None = None
+
+    def text(self, now: "FitProgress") -> str:
+        """What a line of progress says of a step."""
+        loss, psnr = self._values or (now.loss, now.psnr)
+        loss += _SMOOTHING * (now.loss - loss)
+        psnr += _SMOOTHING * (now.psnr - psnr)
+        self._values = loss, psnr
+        speed = now.step / max(now.seconds, 1e-9)
+        return (
+            f"step {now.step}, loss {loss:.4f}, PSNR {psnr:.2f}, {now.count} Gaussians, "
+            f"{speed:.1f} it/s"
+        )
+
+
+@contextmanager
+def fit_progress() -> Generator["Callable[[FitProgress], None]"]:
+    """Share done, smoothed loss and PSNR, count, speed, estimate."""
+    smoothed = _Smoothed()
+    lines = lines_on_stderr("fit")
+    if lines is not None:
+        yield lambda now: lines.show(
+            now.progress, 1.0, text=smoothed.text(now), seconds_left=now.seconds_left
+        )
+        return
+    columns = (
+        TextColumn("{task.percentage:>3.0f}%"),
+        TextColumn("{task.description}"),
+        TimeElapsedColumn(),
+        TextColumn("{task.fields[left]}"),
+    )
+    with _worded_bar("fit", *columns) as (bar, task):
+        shown = 0.0
+
+        def show(now: "FitProgress") -> None:
+            nonlocal shown
+            text = smoothed.text(now)
+            if now.seconds - shown < 0.25:
+                return
+            shown = now.seconds
+            left = f"{now.seconds_left / 60:.1f} min left"
+            bar.update(task, completed=now.progress, total=1.0, description=text, left=left)
+
+        yield show
+
+
+@contextmanager
+def pose_progress() -> Generator["Callable[[PoseProgress], None]"]:
+    """The stage and how much of it is done."""
+
+    def words(now: "PoseProgress") -> str:
+        return f"{now.stage} {now.done}/{now.total}" if now.total else now.stage
+
+    lines = lines_on_stderr("poses")
+    if lines is not None:
+        # Stages take differently long: there is no estimate of the whole.
+        yield lambda now: lines.show(now.done, None, text=words(now))
+        return
+    with _worded_bar("poses", TextColumn("{task.description}"), TimeElapsedColumn()) as (bar, task):
+        yield lambda now: bar.update(
+            task, description=words(now), completed=now.done, total=now.total or None
+        )
+
+
+def typed(words: Sequence[str]) -> str:
+    """The command line; nothing where the command was called from Python."""
+    name = Path(words[0]).name if words else ""
+    if name not in ("splatseg", "__main__.py"):
+        return ""
+    return shlex.join(["splatseg", *words[1:]])
+
+
+def print_result(facts: Mapping[str, Any], lines: Sequence[str], *, json: bool) -> None:
+    """Print what was made: one JSON object, or lines for people.
+
+    Args:
+        facts: What was made, in values that JSON holds; paths become their text.
+        lines: The same in sentences.
+        json: Which of the two.
+    """
+    sys.stdout.write(_json_line(facts) if json else "".join(f"{visible(line)}\n" for line in lines))
+    sys.stdout.flush()
+
+
+def plain(value: object) -> Text:
+    """A value as a table of the terminal shows it: brackets in names are no markup."""
+    return Text(visible(str(value)))
+
+
+def _json_line(facts: Mapping[str, Any]) -> str:
+    return json.dumps(facts, allow_nan=False, default=_path_text) + "\n"
+
+
+def _path_text(value: object) -> str:
+    if isinstance(value, Path):
+        return str(value)
+    raise TypeError(f"expected a value that JSON holds, got {type(value).__name__}.")
+
+
+class ConsoleObserver(Observer):
+    """Shows progress and notes on stderr, and what was found on stdout.
+
+    Args:
+        quiet: Show nothing.
+        json: Stdout is for one JSON object: what was found goes to stderr too.
+    """
+
+    def __init__(self, *, quiet: bool = False, json: bool = False) -> None:
+        self._quiet = quiet
+        self._json = json
+
+    @override
+    @contextmanager
+    def stage(self, stage: str) -> Generator[Callable[[int, int], None]]:
+        """A bar or lines for the stage."""
+        with progress(stage, quiet=self._quiet) as step:
+            yield step
+
+    @override
+    @contextmanager
+    def fit_stage(self) -> Generator["Callable[[FitProgress], None]"]:
+        """With loss and PSNR."""
+        if self._quiet:
+            yield lambda now: None
+            return
+        with fit_progress() as step:
+            yield step
+
+    @override
+    @contextmanager
+    def pose_stage(self) -> Generator["Callable[[PoseProgress], None]"]:
+        """With the names of its parts."""
+        if self._quiet:
+            yield lambda now: None
+            return
+        with pose_progress() as step:
+            yield step
+
+    @override
+    def note(self, message: str) -> None:
+        """A line of its own on stderr."""
+        if not self._quiet:
+            tell(sys.stderr, f"note: {visible(message)}\n")
+
+    @override
+    def info(self, message: str) -> None:
+        """A line of its own."""
+        if not self._quiet:
+            tell(sys.stderr if self._json else sys.stdout, f"{visible(message)}\n")

@@ -1,0 +1,460 @@
+"""Depth of a few views, kept while a field is built from all, to measure its shapes by."""
+
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from splatseg.core import ScanSource, Scene, View
+from splatseg.core.boundary import boundary
+from splatseg.errors import InputError
+from splatseg.io.captures import read_capture
+from splatseg.io.evidence import Evidence
+from splatseg.io.scene import load_scene, new_field_file, remove_field_folder, save_scene
+from splatseg.io.scene_folder import is_scene, scene_lock
+from splatseg.render import BackendName
+from splatseg.report.street_report import DepthError
+from splatseg.street.build import DnmpOptions, MeshFieldFit, MeshFieldInputs, build_mesh_field
+from splatseg.street.depth_views import distances_of
+from splatseg.street.field import MeshField
+from splatseg.street.files import save_mesh_field
+from splatseg.street.geometry import DepthView
+from splatseg.street.hits import PrimitiveCaster
+from splatseg.street.build import PUBLISHED
+from splatseg.street.primitives import PrimitiveMesh
+from splatseg.tasks.moving import LeftOut
+from splatseg.tasks.street_inputs import (
+    DriveInputs,
+    StreetOptions,
+    capture_points,
+    drive_inputs,
+    drive_sources,
+)
+from splatseg.tasks.work import (
+    SILENT,
+    Observer,
+    Work,
+    check_new_folder,
+    layer_versions,
+    scene_of_capture,
+    spread_views,
+    view_spec,
+)
+
+_VIEWS = 6
+_RAYS = 20_000
+"""Of each view, evenly; 28 bytes each."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DepthSample:
+    """Rays of a view whose depth is known."""
+
+    view: str
+    origin: Float[Tensor, "3"]
+    directions: Float[Tensor, "n 3"]
+    """Of length 1, float32."""
+
+    distances: Float[Tensor, "n"]
+    """Along them, scene units, float32."""
+
+
+class KeptDepths:
+    """Depth of views as it is read, of which samples of a few are kept.
+
+    Args:
+        depths: Of the views.
+        views: Whose depth it is; views without depth may be left out, and are then told by their
+            cameras.
+    """
+
+    def __init__(self, depths: Iterable[DepthView], views: Sequence[View]) -> None:
+        self._depths = depths
+        self._wanted = spread_views(views, _VIEWS)
+        self.samples: list[DepthSample] = []
+
+    def __iter__(self) -> Iterator[DepthView]:
+        """All of them, as they are."""
+        for depth in self._depths:
+            pose = depth.camera.cam_from_world  # in any size
+            same = (v for v in self._wanted if torch.equal(v.camera.cam_from_world, pose))
+            view = next(same, None)
+            if view is not None:
+                sample = _sample(view, depth)
+                self.samples += [sample] if len(sample.distances) else []
+            yield depth
+
+
+def _sample(view: View, depth: DepthView) -> DepthSample:
+    known = distances_of(depth)
+    row, column = torch.nonzero(known > 0, as_tuple=True)
+    step = max(1, -(-len(row) // _RAYS))
+    row, column = row[::step], column[::step]
+    pixels = torch.stack((column, row), dim=1).double() + 0.5
+    origin, directions = depth.camera.rays(pixels)
+    return DepthSample(
+        view=view.name,
+        origin=origin.double(),
+        directions=directions.float(),
+        distances=known[row, column],
+    )
+
+
+def depth_errors(
+    samples: Sequence[DepthSample],
+    before: PrimitiveMesh,
+    after: PrimitiveMesh,
+    *,
+    metres_per_unit: float,
+) -> tuple[DepthError, ...]:
+    """How far first hits of rays are from their depth, before the fit of shapes and after it."""
+    casters = [PrimitiveCaster(mesh) if len(mesh) else None for mesh in (before, after)]
+    found: list[DepthError] = []
+    for sample in samples:
+        errors = [_errors(caster, sample) for caster in casters]
+        medians = [
+            float(error.median()) * metres_per_unit if len(error) else None for error in errors
+        ]
+        found.append(
+            DepthError(
+                view=sample.view,
+                rays=len(sample.distances),
+                before=medians[0],
+                after=medians[1],
+                met_before=len(errors[0]) / len(sample.distances),
+                met_after=len(errors[1]) / len(sample.distances),
+            )
+        )
+    return tuple(found)
+
+
+def _errors(caster: PrimitiveCaster | None, sample: DepthSample) -> Float[Tensor, "m"]:
+    """Of the rays that meet a primitive, scene units."""
+    if caster is None:
+        return torch.zeros(0)
+    hits = caster.first(sample.origin, sample.directions)
+    met = hits.faces >= 0
+    return (hits.distances[met].float() - sample.distances[met]).abs()
+
+
+_CELLS = 5
+"""Points are thinned to so many cells along the side of the finest voxel."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class BuiltField:
+    """A mesh field with its record, and how it came to be."""
+
+    field: MeshField
+    fit: MeshFieldFit
+    sources: str
+    """Where points and depth came from, in words."""
+
+    depths: tuple[DepthSample, ...]
+    """Depth of a few of the views."""
+
+
+class FieldBuilder:
+    """Builds fields from what all blocks of a drive have in common.
+
+    Args:
+        work: The scene.
+        inputs: What is learned from.
+        options: What the fields are called, and made from.
+        field_options: How; None is the default, or the published setting where `options` ask
+            for it.
+    """
+
+    def __init__(
+        self,
+        work: Work,
+        inputs: DriveInputs,
+        options: StreetOptions,
+        field_options: DnmpOptions | None,
+    ) -> None:
+        self.work, self.inputs, self.options = work, inputs, options
+        self.chosen = chosen_options(options, field_options)
+        self.layer = options.layer or inputs.name
+        self.timings: dict[str, float] = {}
+
+    def build(
+        self,
+        views: Sequence[View],
+        *,
+        scans: ScanSource | None,
+        points: Float[Tensor, "n 3"] | None,
+        near: Callable[[Float[Tensor, "n 3"]], Bool[Tensor, "n"]] | None = None,
+        details: Mapping[str, Any] | None = None,
+    ) -> BuiltField:
+        """Build the field of some views.
+
+        Args:
+            views: To learn from.
+            scans: In the world of the scene.
+            points: Of the capture, world, scene units.
+            near: Says which points there may be primitives at; None allows all.
+            details: More for the record of the field.
+
+        Raises:
+            InputError: If there are no points or no depth, or they cannot be used.
+        """
+        began = time.monotonic()
+        inputs, observer = self.inputs, self.work.observer
+        observer.info("points and depth are gathered")
+        sources = drive_sources(
+            self.work,
+            views,
+            depth=self.options.depth,
+            scans=scans,
+            points=points,
+            cell=min(self.chosen.voxels) / inputs.metres / _CELLS,
+        )
+        observer.info(f"from {sources.said}")
+        cloud = sources.points if near is None else sources.points[near(sources.points)]
+        self._took("points", time.monotonic() - began)
+        depths = KeptDepths(sources.depths(), views)
+        with _Stages(observer, self._took) as stages:
+            made = build_mesh_field(
+                MeshFieldInputs(
+                    points=cloud,
+                    depths=depths,
+                    views=views,
+                    evidence=inputs.evidence,
+                    classes=inputs.evidence.classes or self.work.scene.classes,
+                    metres_per_unit=inputs.metres,
+                ),
+                options=self.chosen,
+                layer=self.layer,
+                seed=self.options.seed,
+                progress=stages.told,
+            )
+        left_out = {} if inputs.moving is None else {"moving": inputs.moving.record}
+        more = {"sources": sources.said, **left_out, **(details or {})}
+        info = replace(
+            made.field.info,
+            evidence=inputs.name,
+            views_asked=view_spec(self.options.views),
+            versions=layer_versions(),
+            details={**made.field.info.details, **more},
+        )
+        field = made.field.with_layer(info=info)
+        return BuiltField(field=field, fit=made, sources=sources.said, depths=tuple(depths.samples))
+
+    def _took(self, stage: str, seconds: float) -> None:
+        self.timings[stage] = self.timings.get(stage, 0.0) + seconds
+
+
+def chosen_options(options: StreetOptions, given: DnmpOptions | None) -> DnmpOptions:
+    """How fields are made: as given, in the published setting where the field is to be that."""
+    if given is None:
+        return PUBLISHED if options.published else DnmpOptions()
+    return replace(given, setting="published") if options.published else given
+
+
+class _Stages:
+    """Stages of a build as an observer hears of them, and how long they took."""
+
+    def __init__(self, observer: Observer, took: Callable[[str, float], None]) -> None:
+        self._observer, self._took = observer, took
+        self._open: Any = None
+        self._step: Callable[[int, int], None] | None = None
+        self._name = ""
+        self._began = 0.0
+
+    def __enter__(self) -> "_Stages":
+        self._began = time.monotonic()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._close()
+
+    def told(self, stage: str, done: int, total: int) -> None:
+        """A stage has come so far."""
+        if stage != self._name:
+            self._close()
+            self._name = stage
+            self._open = self._observer.stage(stage)
+            self._step = self._open.__enter__()
+        if self._step is not None:
+            self._step(done, total)
+
+    def _close(self) -> None:
+        if self._open is not None:
+            self._open.__exit__(None, None, None)
+            now = time.monotonic()
+            self._took(self._name, now - self._began)
+            self._began = now
+        self._open, self._step = None, None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class StreetField:
+    """A mesh field, and what it was made from."""
+
+    field: MeshField
+    name: str
+    """What the field is to be called."""
+
+    layer: str
+    fit: MeshFieldFit
+    views: tuple[View, ...]
+    evidence: Evidence
+    sources: str
+    """Where points and depth came from, in words."""
+
+    depths: tuple[DepthSample, ...] = ()
+    """Depth of a few of the views, to measure shapes by."""
+
+    moving: LeftOut | None = None
+    """What was left out with moving things; None where nothing was to be."""
+
+    timings: Mapping[str, float]
+    """Seconds by stage."""
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """Figures in values that JSON holds."""
+        mesh = self.field.mesh
+        records = self.fit.geometry.records
+        last = self.fit.radiance.records[-1]
+        return {
+            "field": self.name,
+            "layer": self.layer,
+            "primitives": len(mesh),
+            "primitives_by_level": [
+                int((mesh.levels == level).sum()) for level in range(len(mesh.sizes))
+            ],
+            "classes": len(self.field.model.ids),
+            "views": len(self.views),
+            "rays": self.fit.radiance.rays,
+            "hits": self.fit.radiance.hits,
+            "depth_rays": self.fit.geometry.rays,
+            "depth_loss": None if not records else round(records[-1].loss, 6),
+            "removed_around_cameras": self.fit.geometry.enclosing,
+            "removed_before_surfaces": self.fit.geometry.carved,
+            "iterations": last.iterations,
+            "colour_loss": round(last.colour_loss, 6),
+            "semantic_loss": round(last.semantic_loss, 6),
+            "radius": self.field.radius,
+            "sources": self.sources,
+            **({} if self.moving is None else {"moving": self.moving.record}),
+            "stage_seconds": {name: round(value, 3) for name, value in self.timings.items()},
+        }
+
+
+@boundary
+def open_drive(path: Path, *, new_scene: Path | None = None, data: Path | None = None) -> Scene:
+    """The scene of a drive: one that is there, or a new one without Gaussians of a capture.
+
+    Args:
+        path: A scene folder, or that of a capture.
+        new_scene: With a capture, the scene folder to write; one without Gaussians that an earlier
+            call wrote of it is opened.
+        data: With a scene, the capture's folder, where it was moved.
+
+    Raises:
+        InputError: If it is neither, or the new scene's place is taken.
+        MissingFileError: If there is nothing at the path.
+    """
+    if is_scene(path):
+        if new_scene is not None:
+            raise InputError(
+                f"new_scene: expected none with {path}, which is a scene, got {new_scene}."
+            )
+        return load_scene(path, data=data)
+    capture = read_capture(path)
+    if new_scene is None:
+        raise InputError(
+            f"new_scene: expected a scene folder to write the field of {path} to, a capture, "
+            "got none."
+        )
+    if is_scene(new_scene):
+        there = load_scene(new_scene)
+        if len(there.gaussians) or there.source is None or there.source.resolve() != path.resolve():
+            raise InputError(
+                f"{new_scene}: expected a new folder or a scene without Gaussians of {path}, got "
+                "another scene; give that scene instead of the capture."
+            )
+        return there
+    check_new_folder(new_scene)
+    save_scene(scene_of_capture(capture, provenance={"command": "street"}), new_scene)
+    # As later calls see it: matrices of a file are those of the capture but for the last bits.
+    return load_scene(new_scene)
+
+
+@boundary
+def street_field(
+    scene: Scene,
+    *,
+    options: StreetOptions | None = None,
+    field_options: DnmpOptions | None = None,
+    points: Float[Tensor, "n 3"] | None = None,
+    backend: BackendName = "auto",
+    observer: Observer = SILENT,
+) -> StreetField:
+    """Make the mesh field of a drive: primitives at its surfaces, with colours and classes.
+
+    Args:
+        scene: The scene; it stays as it is. `save_street_field` writes the field into it. It may
+            have no Gaussians.
+        options: What the field is made from.
+        field_options: How; None is the default, or the published setting where `options` ask
+            for it.
+        points: On surfaces, world, scene units, to put primitives at; None takes those of the
+            capture and of scans, where there are any.
+        backend: Rendering backend of Gaussians, for their depth.
+        observer: Is told of the progress.
+
+    Raises:
+        InputError: If evidence, photographs, points or depth are not there, or do not fit together.
+    """
+    options = options or StreetOptions()
+    if options.block_length is not None:
+        raise InputError(
+            f"block_length: expected none of one field, got {options.block_length:g} m; "
+            "`make_street_field` makes drives in blocks."
+        )
+    work = Work(scene=scene, backend=backend, observer=observer)
+    with drive_inputs(work, options) as inputs:
+        builder = FieldBuilder(work, inputs, options, field_options)
+        made = builder.build(
+            inputs.views,
+            scans=inputs.scans,
+            points=capture_points(inputs.capture) if points is None else points,
+        )
+    return StreetField(
+        field=made.field,
+        name=options.field,
+        layer=made.field.layer_names[0],
+        fit=made.fit,
+        # As the scene has them: masks without moving things were there for the training alone.
+        views=tuple(scene.view(view.name) for view in inputs.views),
+        evidence=inputs.evidence,
+        sources=made.sources,
+        depths=made.depths,
+        moving=inputs.moving,
+        timings=builder.timings,
+    )
+
+
+@boundary
+def save_street_field(made: StreetField, root: Path) -> Path:
+    """Write the field into the scene's folder; one of the same name in any form is replaced.
+
+    Returns:
+        The file.
+
+    Raises:
+        InputError: If another process works on the scene.
+        OutputError: If it cannot be written.
+    """
+    with scene_lock(root, "saving"):
+        path = new_field_file(root, made.name)
+        save_mesh_field(made.field, path)
+        remove_field_folder(root, made.name)
+    return path
