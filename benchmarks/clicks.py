@@ -50,7 +50,7 @@ from splatseg.errors import InputError
 from splatseg.io.evidence import open_evidence
 from splatseg.io.scene import load_scene, load_scene_layer
 from splatseg.lift import uplift
-from splatseg.lift.mass.segment_masses import view_masses
+from splatseg.lift.voting.segment_masses import view_masses
 from splatseg.prompting.feature_source import FeatureSource, FeatureSourceOptions
 from splatseg.prompting.prompts import ViewPrompt
 from splatseg.tasks import SelectOptions, open_selector

@@ -49,7 +49,7 @@ from splatseg.lift import (
     label_map,
     uplift,
 )
-from splatseg.lift.heads import ClassifierHead
+from splatseg.lift.label_maps import ClassifierHead
 from splatseg.methods import find_method
 from splatseg.tasks.segment import segment
 from splatseg.tasks.segment_options import SegmentOptions

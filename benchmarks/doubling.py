@@ -34,8 +34,8 @@ from splatseg.edit import load_document
 from splatseg.io.layers import save_layer
 from splatseg.io.scene import save_scene
 from splatseg.lift import label_map, uplift
-from splatseg.lift.pipeline import lift_labels
 from splatseg.methods.associate import associate
+from splatseg.methods.uplift import lift_labels
 from splatseg.render import render
 from splatseg.tasks.edit import edit_scene
 from splatseg.tasks.edit_options import EditOptions

@@ -28,8 +28,8 @@ from scored import ScoredScene, run_rows
 
 from splatseg.core import InstanceTree, Labels, MaskSet
 from splatseg.io.evidence import open_evidence
-from splatseg.lift.completion.complete import complete
-from splatseg.lift.segments.recorded import EvidenceSegments
+from splatseg.lift.completion import complete
+from splatseg.lift.segments import EvidenceSegments
 from splatseg.methods.associate import AssociateOptions, associate
 
 _CUTS = ("group", "object", "part", 0.75)

@@ -32,14 +32,16 @@ from scipy.sparse.csgraph import connected_components
 from splatseg.core import Gaussians, MaskSet
 from splatseg.io.evidence import open_evidence
 from splatseg.io.scene import load_scene
-from splatseg.lift.segments.clustering import cluster
-from splatseg.lift.segments.levels import node_levels
-from splatseg.lift.segments.nesting import Nesting, nesting
-from splatseg.lift.segments.recorded import EvidenceSegments
-from splatseg.lift.segments.separate import separated_levels
-from splatseg.lift.segments.table import SegmentTable, segment_table
-from splatseg.lift.segments.tree import SegmentTree, segment_tree
+from splatseg.lift.segments import EvidenceSegments
 from splatseg.methods.associate import AssociateOptions
+from splatseg.methods.associate._clustering import Nesting, cluster, nesting
+from splatseg.methods.associate._table import SegmentTable, segment_table
+from splatseg.methods.associate._tree import (
+    SegmentTree,
+    node_levels,
+    segment_tree,
+    separated_levels,
+)
 from splatseg.neighbours import NeighbourIndex
 
 _LEVELS = ("part", "object", "group")

@@ -33,6 +33,8 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image
+from splatseg.methods.logits import LogitOptions, train_logits
+from splatseg.methods.probabilities import train_probabilities
 from street_field import peak
 from torch.utils.flop_counter import FlopCounterMode
 
@@ -40,7 +42,7 @@ from splatseg.core import Features, LabelMap, Scene
 from splatseg.io.evidence import open_evidence
 from splatseg.io.scene import load_scene
 from splatseg.lift import label_map
-from splatseg.lift.heads import ClassifierHead
+from splatseg.lift.label_maps import ClassifierHead
 from splatseg.lift.training import (
     AdamConstants,
     LabelTargets,
@@ -51,8 +53,6 @@ from splatseg.lift.training import (
 )
 from splatseg.methods import find_method
 from splatseg.methods.identity import IdentityOptions, TrainingContext, train_identity
-from splatseg.methods.logits import LogitOptions, train_logits
-from splatseg.methods.probabilities import train_probabilities
 from splatseg.tasks.segment import segment
 from splatseg.tasks.segment_options import SegmentOptions
 

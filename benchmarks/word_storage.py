@@ -38,7 +38,7 @@ from word_scene import WordScene
 
 from splatseg.core.voxel_features import StoredTable
 from splatseg.io.scene import load_scene
-from splatseg.lift.relevancy import TextSpace
+from splatseg.lift.vocabulary import TextSpace
 from splatseg.lift.voxels import TableWords, store
 
 _CHUNK = 16_384

@@ -9,7 +9,7 @@ from splatseg.core.models import Boxes
 from splatseg.core.renderable import PointLabels
 from splatseg.errors import RangeError
 from splatseg.evaluate import psnr, ssim
-from splatseg.lift.relevancy import relevancy
+from splatseg.lift.vocabulary import relevancy
 
 IDS = torch.tensor([1, 2], dtype=torch.int32)
 SURE = torch.ones(2)

@@ -16,7 +16,7 @@ from splatseg.core import (
 )
 from splatseg.evaluate import LearnedBytes, learned_bytes
 from splatseg.lift.affinity import AffinityHead
-from splatseg.lift.heads import ClassifierHead
+from splatseg.lift.label_maps import ClassifierHead
 
 COUNT = 5
 

@@ -10,7 +10,7 @@ from splatseg.core import Features, Gaussians
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.evaluate.metrics import Confusion, semantic_score
 from splatseg.lift import PointLabelOptions, labels_of_points, point_labels
-from splatseg.lift.heads import ClassifierHead
+from splatseg.lift.label_maps import ClassifierHead
 from splatseg.lift.point_labels import classified_points
 
 

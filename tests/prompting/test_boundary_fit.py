@@ -6,6 +6,7 @@ import torch
 from splatseg.core import Selection
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.lift import CutOptions
+from splatseg.lift.boundaries import cut
 from splatseg.prompting.boundary_fit import TrimOptions, ViewMasks, split, trim
 from support.ball_rows import balls_at, view_of
 
@@ -52,10 +53,11 @@ def test_pixels_at_the_rim_count_less() -> None:
         assert trim(g, all_of(1), [VIEW], shifted, options=options).count == kept
 
 
-def test_parts_of_what_straddles_stay_on_the_inner_side() -> None:
+def test_parts_of_what_straddles_stay_on_the_inner_side(monkeypatch) -> None:
     g = balls_at([[-2, 0, 0], [0, 0, 0], [2, 0, 0]], scale=0.5)
     selection = Selection(mask=torch.tensor([True, True, False]))
-    edited, fitted = split(g, selection, [VIEW], left_half(), options=CutOptions(rounds=1))
+    monkeypatch.setattr(cut, "_ROUNDS", 1)
+    edited, fitted = split(g, selection, [VIEW], left_half(), options=CutOptions())
     assert len(edited) == len(fitted) == 5, "one became three"
     assert edited.rows.tolist() == [0, 2, 1, 1, 1]
     x = edited.gaussians.means[:, 0]

@@ -8,7 +8,7 @@ import torch
 
 from splatseg.core import Features, Selection
 from splatseg.errors import RangeError, ShapeError
-from splatseg.lift.completion.graph import NodeAttributes, flat_normals, neighbour_graph
+from splatseg.lift.neighbour_graph import NodeAttributes, flat_normals, neighbour_graph
 from splatseg.prompting.graph import GraphOptions, build_graph
 from splatseg.selection import components
 from support.ball_rows import balls_at, graph_of, grid, row_of

@@ -9,7 +9,7 @@ import tyro
 
 from splatseg.cli._types import Json, Linear, Overwrite, Quiet, Strict
 from splatseg.cli._work import ConsoleObserver, print_result
-from splatseg.lift import AttachOptions
+from splatseg.lift import MatchOptions
 from splatseg.tasks import AttachedLayers, AttachLayersOptions, attach_layers
 
 
@@ -68,7 +68,7 @@ class Command:
     json: Json = False
     quiet: Quiet = False
 
-    search: AttachOptions = field(default_factory=AttachOptions)
+    search: MatchOptions = field(default_factory=MatchOptions)
     """Limits of the search."""
 
 

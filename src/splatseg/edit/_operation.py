@@ -9,6 +9,7 @@ import torch
 
 from splatseg.core import Similarity
 from splatseg.core.boundary import convert_fields
+from splatseg.core.options import removed_options
 from splatseg.errors import InputError, RangeError
 from splatseg.lift.boundaries.cut import CutOptions
 from splatseg.selection import Where
@@ -236,10 +237,11 @@ def _cut(content: Mapping[str, Any]) -> CutBy:
         isinstance(view, str) for view in cast("list[Any]", views)
     ):
         raise InputError(f"cut: expected views as a list of names, got {views!r:.60}.")
-    _known("options", options, {f.name for f in fields(CutOptions)})
+    known = {f.name for f in fields(CutOptions)}
+    _known("options", options, known | set(removed_options(CutOptions)))
+    options = {name: value for name, value in options.items() if name in known}
     for name, value in options.items():
-        wanted = (int,) if name in ("parts", "rounds") else (int, float)
-        if isinstance(value, bool) or not isinstance(value, wanted):
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
             raise InputError(f"cut: expected a number as {name}, got {value!r:.60}.")
     return CutBy(
         by=by,

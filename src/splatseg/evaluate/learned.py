@@ -23,7 +23,7 @@ from splatseg.core import (
 )
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.lift.affinity import KIND, AffinityHead
-from splatseg.lift.heads import ClassifierHead, has_classifier
+from splatseg.lift.label_maps import ClassifierHead, has_classifier
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

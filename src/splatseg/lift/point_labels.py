@@ -7,7 +7,7 @@ The nearest Gaussians vote with their density at the point x, as they do in a la
           \qquad \mathrm{id}(x) = \arg\max_c \sum_i d_i(x)\, a_{ic}
 
 with :math:`a_{ic}` as in `splatseg.lift.label_map`: 1 for the id of a Gaussian. Trained features
-are read as in views (`splatseg.lift.heads`), with :math:`d_i / \sum_j d_j` for blending weights.
+are read as in views (`splatseg.lift.label_maps`), with :math:`d_i / \sum_j d_j` for blending weights.
 
 References:
     Wu et al., OpenGaussian (NeurIPS 2024): points of ScanNet take labels of Gaussians, faint
@@ -28,7 +28,7 @@ from splatseg.core import UNLABELLED, Features, Gaussians, PointLabels
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.rigid import rotation_from_quaternion
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.lift.heads import ClassifierHead
+from splatseg.lift.label_maps import ClassifierHead
 from splatseg.neighbours import NeighbourIndex
 
 PointRule = Literal["weighted", "nearest"]

@@ -21,7 +21,7 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from splatseg.methods._label_losses import TINY
+from splatseg.methods._trained import TINY
 
 LabelLoss = Literal["cross_entropy", "generalised", "symmetric", "bootstrap"]
 LABEL_LOSSES: tuple[LabelLoss, ...] = get_args(LabelLoss)

@@ -10,7 +10,7 @@ import torch
 
 from splatseg.core import Features, InstanceTree, LayerInfo
 from splatseg.errors import InputError
-from splatseg.lift.segments.recorded import EvidenceSegments
+from splatseg.lift.segments import EvidenceSegments
 from splatseg.lift.words import UnmixOptions, object_features
 from splatseg.methods._method import Method, MethodInputs
 from splatseg.methods.associate import associate

@@ -24,9 +24,7 @@ from splatseg._check import check_range
 from splatseg.core import Edited, Gaussians, LabelMap, Selection, View
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.lift.boundaries.cut import INSIDE, OUTSIDE, CutOptions, cut_masks
-from splatseg.lift.boundaries.sides import sides_of
-from splatseg.render import options_for
+from splatseg.lift.boundaries.cut import INSIDE, OUTSIDE, CutOptions, cut_masks, sides_of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -106,16 +104,8 @@ def trim(
     """
     options = options or TrimOptions()
     _check(gaussians, selection, views, masks)
-    ones = torch.ones(len(gaussians), dtype=torch.int32)
     sides = sides_of(
-        gaussians,
-        views,
-        masks,
-        ones * INSIDE,
-        ones * OUTSIDE,
-        border_weight=options.border_weight,
-        options=options_for(gaussians, backend),
-        backend=backend,
+        gaussians, views, masks, [INSIDE], border_weight=options.border_weight, backend=backend
     )
     seen = sides.inside + sides.outside
     out = (seen > 0) & (seen >= options.min_weight) & (1 - sides.share > options.max_outside)

@@ -19,7 +19,7 @@ from torch import Tensor
 from splatseg.core import Features, Gaussians
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import RangeError, ShapeError
-from splatseg.lift.completion.graph import NodeAttributes, flat_normals, neighbour_graph
+from splatseg.lift.neighbour_graph import NodeAttributes, flat_normals, neighbour_graph
 from splatseg.selection import touching
 
 

@@ -26,7 +26,7 @@ from splatseg._check import check_range, check_values
 from splatseg.core import Selection
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import RangeError
-from splatseg.lift.completion.graph import transition_matrix
+from splatseg.lift.neighbour_graph import transition_matrix
 from splatseg.prompting.graph import NeighbourGraph
 from splatseg.selection import pieces
 

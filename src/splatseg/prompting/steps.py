@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from splatseg.core import LabelMap, Selection
-from splatseg.lift.mass.segment_masses import view_masses
+from splatseg.lift.voting.segment_masses import view_masses
 from splatseg.prompting.context import SelectionContext
 from splatseg.prompting.filtering import statistical_filter
 from splatseg.prompting.growing import ball_grow, region_grow

@@ -14,7 +14,7 @@ from splatseg.core.boundary import boundary
 from splatseg.errors import InputError
 from splatseg.io.images import save_png
 from splatseg.io.paths import path_inside
-from splatseg.lift.field_layers import selection_labels
+from splatseg.lift.field import selection_labels
 from splatseg.lift.label_maps import view_label_map
 from splatseg.render import BackendName, PreparedView, prepare
 from splatseg.report.selection_picture import selection_picture

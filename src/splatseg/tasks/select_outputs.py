@@ -13,7 +13,7 @@ from splatseg.errors import InputError, MissingFileError
 from splatseg.io.images import save_png
 from splatseg.io.paths import path_inside
 from splatseg.io.splats import write_splats
-from splatseg.lift.field_layers import selection_labels
+from splatseg.lift.field import selection_labels
 from splatseg.lift.label_maps import view_label_map
 from splatseg.prompting.prompts import Lasso, SelectionPrompt, ViewPrompt
 from splatseg.render import BackendName, prepare

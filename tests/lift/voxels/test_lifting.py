@@ -10,7 +10,7 @@ from lift.conftest import BACKEND, camera_at, gaussians_at, random_gaussians
 from splatseg import _native
 from splatseg.core import FeatureMap, View
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.lift.mass.features import uplift_features
+from splatseg.lift.voting.features import uplift_features
 from splatseg.lift.voxels import reference
 from splatseg.lift.voxels.assignment import AssignmentOptions, assign_voxels
 from splatseg.lift.voxels.filtering import FilterOptions, surface_gaussians

@@ -13,7 +13,7 @@ from splatseg.core import UNLABELLED, FeatureMap, Labels
 from splatseg.core.sh import base_colours
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.lift import label_map
-from splatseg.lift.completion.graph import NodeAttributes, neighbour_graph
+from splatseg.lift.neighbour_graph import NodeAttributes, neighbour_graph
 from splatseg.lift.voxels.assignment import AssignmentOptions, assign_voxels
 from splatseg.lift.voxels.grid import voxelise
 from splatseg.lift.voxels.lifting import HitOptions, lift_to_voxels

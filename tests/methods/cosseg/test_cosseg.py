@@ -9,9 +9,9 @@ import torch
 from splatseg.core import Features, LabelMap, View
 from splatseg.core.checkpoints import Checkpoints
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.lift.heads import ClassifierHead
+from splatseg.lift.label_maps import ClassifierHead
 from splatseg.lift.point_network import spatial_features
-from splatseg.methods._trained_labels import TrainingContext
+from splatseg.methods._trained import TrainingContext
 from splatseg.methods.cosseg import CossegOptions, train_cosseg
 from splatseg.methods.cosseg._decoded_layer import decoded_in_views
 

@@ -11,11 +11,11 @@ from PIL import Image
 from splatseg.core import LabelMap
 from splatseg.errors import InputError, RangeError
 from splatseg.lift.point_network import SpatialOptions
-from splatseg.methods._label_models import linear_start
 from splatseg.methods.cosseg._distilled import distilled_features
 from splatseg.methods.cosseg._fusion import FusionShape, decode_all
 from splatseg.methods.cosseg._joint import JointOptions, LabelLoss, train_jointly
 from splatseg.methods.cosseg._points import PointSource
+from splatseg.methods.identity import linear_start
 from splatseg.render import render
 
 from .conftest import Maps

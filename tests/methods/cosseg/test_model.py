@@ -6,8 +6,8 @@ import torch
 
 from splatseg.core import Labels
 from splatseg.errors import InputError
-from splatseg.lift.mass.uplift import UpliftOptions, uplift
 from splatseg.lift.training import LabelTargets, RowSampler, SamplingOptions, Values
+from splatseg.lift.voting.uplift import UpliftOptions, uplift
 from splatseg.methods.cosseg._agreement import VoteAgreement
 from splatseg.methods.cosseg._fusion import FusionInputs, FusionShape
 from splatseg.methods.cosseg._model import FusionModel, transferred

@@ -27,7 +27,7 @@ from splatseg.io.evidence import create_evidence, save_masks
 from splatseg.io.scene import load_scene
 from splatseg.lift import GaussianField
 from splatseg.lift.affinity import AffinityHead
-from splatseg.methods import Method, MethodInputs, _registry, register_method
+from splatseg.methods import Method, MethodInputs, _method, register_method
 from splatseg.methods.uplift import UpliftMethodOptions
 from splatseg.tasks import select_session
 from splatseg.tasks._select_sources import Offer, OpenedSource, open_source
@@ -113,7 +113,7 @@ def run(tiny: tuple[Path, Path], tmp_path: Path) -> Iterator[Callable[..., Bench
         )
     )  # fmt: skip
     yield go
-    del _registry._REGISTERED["stranger"]
+    del _method._REGISTERED["stranger"]
 
 
 def masks(folder: Path) -> Path:

@@ -20,7 +20,7 @@ from splatseg.evaluate.protocols import TABLE_1, find_protocol, merged_name
 from splatseg.io.benchmarks import read_benchmark
 from splatseg.io.scene import load_scene, save_scene
 from splatseg.methods import Method, register_method, uplift
-from splatseg.methods import _registry as registry
+from splatseg.methods import _method as registry
 from splatseg.tasks.benchmark import BenchOptions, BenchRun, bench, bench_table, load_result
 from splatseg.tasks.benchmark.fits import scans_of
 from splatseg.tasks.scene_parts import scene_field

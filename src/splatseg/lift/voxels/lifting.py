@@ -27,8 +27,8 @@ from splatseg.core import UNLABELLED, FeatureMap, FeatureSource, Gaussians, View
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.voxels import VoxelGrid
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.lift.mass.adjoint import RenderAdjoint, voting_views
-from splatseg.lift.mass.features import Taps, camera_of_grid, checked_grid, grid_taps, read_grid
+from splatseg.lift.voting.features import Taps, camera_of_grid, checked_grid, grid_taps, read_grid
+from splatseg.lift.voting.uplift import RenderAdjoint, voting_views
 from splatseg.lift.voxels.grid import MAX_HITS, GridIndex
 from splatseg.lift.voxels.solving import VoxelMixing, parts_of
 from splatseg.render import options_for
@@ -240,7 +240,6 @@ class _Sums:
                     features[..., part],
                     cells=(covered[0] / grid.stride, covered[1] / grid.stride),
                     size=(camera.height, camera.width),
-                    resampling="bilinear",
                 )
                 sums, weights = adjoint.back_project(prepared, image)
                 if factor is None:

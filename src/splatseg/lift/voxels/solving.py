@@ -37,9 +37,9 @@ from splatseg.core import UNLABELLED, FeatureMap, Gaussians, Labels, View
 from splatseg.core.sh import base_colours
 from splatseg.core.threads import one_torch_thread
 from splatseg.core.voxels import VoxelGrid
-from splatseg.lift.completion.graph import NodeAttributes, neighbour_graph
 from splatseg.lift.label_maps import label_map
-from splatseg.lift.mass.features import camera_of_grid
+from splatseg.lift.neighbour_graph import NodeAttributes, neighbour_graph
+from splatseg.lift.voting.features import camera_of_grid
 from splatseg.lift.words.object_features import pixel_cells
 
 NEIGHBOURS = 16

@@ -17,8 +17,7 @@ from splatseg.core.boundary import boundary
 from splatseg.core.threads import one_torch_thread
 from splatseg.core.voxel_features import StoredTable, VoxelFeatures
 from splatseg.errors import InputError, ShapeError
-from splatseg.lift.relevancy import TextSpace
-from splatseg.lift.vocabulary import Vocabulary
+from splatseg.lift.vocabulary import TextSpace, Vocabulary
 from splatseg.lift.voxels.storage import products, store
 from splatseg.lift.words import AnswerOptions, WordAnswers, WordSpan, context_of, word_span
 

@@ -31,8 +31,8 @@ from splatseg.core import UNLABELLED, FeatureMap, FeatureSource, Gaussians, Labe
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.lift.label_maps import label_map
-from splatseg.lift.mass.adjoint import voting_views
-from splatseg.lift.mass.features import camera_of_grid, checked_grid
+from splatseg.lift.voting.features import camera_of_grid, checked_grid
+from splatseg.lift.voting.uplift import voting_views
 from splatseg.lift.words.unmixing import NormalEquations, blurred
 from splatseg.render import RenderOptions
 

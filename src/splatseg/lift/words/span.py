@@ -26,7 +26,7 @@ from splatseg._check import check_finite, check_shape
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.threads import one_torch_thread
 from splatseg.errors import RangeError, ShapeError
-from splatseg.lift.relevancy import TextSpace
+from splatseg.lift.vocabulary import TextSpace
 
 _TINY = 1e-12
 

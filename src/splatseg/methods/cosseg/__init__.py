@@ -24,7 +24,7 @@ from typing import TypeVar
 
 from splatseg.core import Layer
 from splatseg.methods._method import Method, MethodInputs, Refined
-from splatseg.methods._trained_labels import context_of, hard_labels
+from splatseg.methods._trained import context_of, hard_labels
 from splatseg.methods.cosseg._blocks import BlockSource as BlockSource
 from splatseg.methods.cosseg._distilled import distilled_features as distilled_features
 from splatseg.methods.cosseg._linked import LinkedLabels, linked_labels

@@ -12,7 +12,7 @@ from torch import Tensor
 from splatseg.core import Labels
 from splatseg.errors import InputError
 from splatseg.lift.training import Batch
-from splatseg.methods._label_losses import TINY
+from splatseg.methods._trained import TINY
 
 
 class VoteAgreement:

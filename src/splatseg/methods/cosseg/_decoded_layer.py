@@ -10,9 +10,9 @@ from torch import Tensor
 
 from splatseg.core import ClassTable, Features, LayerInfo
 from splatseg.core.threads import one_torch_thread
-from splatseg.lift.heads import Blend, ClassifierHead
+from splatseg.lift.label_maps import Blend, ClassifierHead
 from splatseg.lift.training import TrainingResult
-from splatseg.methods._trained_labels import LabelData, layer_info, recorded_options
+from splatseg.methods._trained import LabelData, layer_info, recorded_options
 from splatseg.methods.cosseg._fusion import Weights, decode_all
 from splatseg.methods.cosseg._given import Given
 from splatseg.methods.cosseg._points import PointSet

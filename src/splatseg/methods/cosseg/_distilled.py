@@ -20,8 +20,8 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from splatseg.core import Gaussians, View
-from splatseg.lift.mass.adjoint import voting_views
-from splatseg.lift.mass.features import FeatureUpliftOptions, uplift_features
+from splatseg.lift.voting.features import FeatureUpliftOptions, uplift_features
+from splatseg.lift.voting.uplift import voting_views
 from splatseg.methods.cosseg._blocks import BlockSource, ReducedBlocks
 from splatseg.render import RenderOptions, options_for, weights
 

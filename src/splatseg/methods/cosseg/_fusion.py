@@ -34,7 +34,7 @@ from torch.nn.functional import batch_norm, embedding, leaky_relu
 
 from splatseg.errors import ShapeError
 from splatseg.lift.point_network.layers import MOMENTUM
-from splatseg.methods._label_models import linear_start
+from splatseg.methods._trained import linear_start
 
 SLOPE = 0.2
 """Of the leaky ReLUs, as RandLA-Net has them."""

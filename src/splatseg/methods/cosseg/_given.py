@@ -18,7 +18,7 @@ from splatseg.lift.point_network import (
     load_point_encoder,
     scene_options,
 )
-from splatseg.methods._trained_labels import LabelData, TrainingContext
+from splatseg.methods._trained import LabelData, TrainingContext
 from splatseg.methods.cosseg._blocks import BlockSource
 from splatseg.methods.cosseg._distilled import (
     DistilledFeatures,

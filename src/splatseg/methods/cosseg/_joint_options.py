@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from splatseg._check import check_range
 from splatseg.core.boundary import convert_fields
 from splatseg.errors import RangeError
-from splatseg.methods._trained_options import check_rate
+from splatseg.methods._trained import check_rate
 
 PUBLISHED_RGB_WEIGHT = 0.2
 """On L1, as equation 5 is printed; the usual is 0.8."""

@@ -7,8 +7,7 @@ from typing import Literal
 from splatseg.core import InstanceTree, Labels, LabelSource
 from splatseg.errors import InputError
 from splatseg.io.evidence import TrackedEvidence
-from splatseg.lift.segments.matching import MatchedMaps
-from splatseg.lift.segments.recorded import EvidenceSegments
+from splatseg.lift.segments import EvidenceSegments, MatchedMaps
 from splatseg.methods._method import MethodInputs
 from splatseg.methods.associate import associate
 

@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from splatseg.lift.heads import Blend
+from splatseg.lift.label_maps import Blend
 from splatseg.lift.training import Batch, Parameter, Values
-from splatseg.methods._label_losses import TINY, LabelCounts
 from splatseg.methods._robust_losses import LabelLoss, label_loss
+from splatseg.methods._trained import TINY, LabelCounts
 from splatseg.methods.cosseg._fusion import (
     RUNNING,
     FusionShape,

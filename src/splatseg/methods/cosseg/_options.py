@@ -6,10 +6,10 @@ from typing import Literal, get_args
 
 from splatseg._check import check_choice, check_range
 from splatseg.errors import RangeError
-from splatseg.lift.heads import Blend
+from splatseg.lift.label_maps import Blend
 from splatseg.lift.training import SamplingOptions, TrainingOptions
 from splatseg.methods._robust_losses import LABEL_LOSSES, LabelLoss
-from splatseg.methods._trained_options import LabelTrainingOptions, check_rate
+from splatseg.methods._trained import LabelTrainingOptions, check_rate
 from splatseg.methods.cosseg._distilled import Division
 from splatseg.methods.cosseg._joint_options import JointOptions
 from splatseg.methods.cosseg._linked import Link

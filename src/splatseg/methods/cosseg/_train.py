@@ -10,9 +10,9 @@ import torch
 from splatseg.core import ClassTable, Features, Gaussians, LabelSource, View
 from splatseg.core.boundary import boundary
 from splatseg.core.threads import one_torch_thread
-from splatseg.lift.mass.uplift import UpliftOptions, uplift
 from splatseg.lift.training import held_out_views
-from splatseg.methods._trained_labels import (
+from splatseg.lift.voting.uplift import UpliftOptions, uplift
+from splatseg.methods._trained import (
     LabelData,
     TrainingContext,
     label_data,

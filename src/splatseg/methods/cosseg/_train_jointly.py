@@ -9,7 +9,7 @@ from splatseg.core import ClassTable, Features, Gaussians, LabelSource, View
 from splatseg.core.boundary import boundary
 from splatseg.core.threads import one_torch_thread
 from splatseg.lift.training import TrainingResult
-from splatseg.methods._trained_labels import TrainingContext, label_data
+from splatseg.methods._trained import TrainingContext, label_data
 from splatseg.methods.cosseg._blocks import BlockSource
 from splatseg.methods.cosseg._decoded_layer import decoded_layer, decoded_together
 from splatseg.methods.cosseg._distilled import pixel_counts

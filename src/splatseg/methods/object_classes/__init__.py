@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from splatseg.core import ClassTable, LabelMap, Labels
 from splatseg.errors import InputError
 from splatseg.io.evidence import PanopticEvidence, TrackedEvidence
-from splatseg.lift.segments.recorded import EvidenceSegments
+from splatseg.lift.segments import EvidenceSegments
 from splatseg.methods._method import Method, MethodInputs
 from splatseg.methods.object_classes._objects import label_objects
 from splatseg.methods.object_classes._options import ObjectLabelOptions as ObjectLabelOptions

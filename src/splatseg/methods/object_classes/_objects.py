@@ -25,15 +25,15 @@ from splatseg.core import (
     LayerInfo,
     View,
 )
-from splatseg.lift.mass.uplift import UpliftOptions, uplift
 from splatseg.lift.object_classes import (
     PooledObjects,
     classify_objects,
     pool_objects,
     with_categories,
 )
-from splatseg.lift.segments.table import SegmentSource
+from splatseg.lift.voting.uplift import UpliftOptions, uplift
 from splatseg.methods.associate import associate
+from splatseg.methods.associate._table import SegmentSource
 from splatseg.methods.cosseg import BlockSource, distilled_features
 from splatseg.methods.object_classes._options import ObjectLabelOptions
 from splatseg.methods.object_classes._shares import CANDIDATES, own_share, spread

@@ -22,8 +22,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatseg.core import UNLABELLED, Labels
-from splatseg.lift.mass.confusion import correct_confusion
 from splatseg.lift.object_classes import PooledObjects, heterogeneity
+from splatseg.lift.voting.confusion import correct_confusion
 from splatseg.methods.object_classes._options import ObjectLabelOptions
 
 CANDIDATES = 16

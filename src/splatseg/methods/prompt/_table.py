@@ -28,8 +28,8 @@ from splatseg.core import FeatureMap, FeatureSource, Gaussians, MaskSet, Rle, Vi
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError
 from splatseg.io.evidence import Evidence
-from splatseg.lift.mass.features import checked_grid
-from splatseg.lift.mass.segment_masses import ViewMasses, view_masses
+from splatseg.lift.voting.features import checked_grid
+from splatseg.lift.voting.segment_masses import ViewMasses, view_masses
 from splatseg.lift.words import ThingLooks, thing_looks
 from splatseg.lift.words.object_features import BLURS, cell_shares
 from splatseg.lift.words.unmixing import NormalEquations, blurred

@@ -23,8 +23,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatseg.core import Gaussians, Rle, View
-from splatseg.lift.mass.centres import centres_in, unoccluded
 from splatseg.methods.prompt._options import VoteRule
+from splatseg.methods.vote import centres_in, unoccluded
 from splatseg.neighbours import NeighbourIndex
 from splatseg.render import PreparedView, RenderOptions, SparseImage
 

@@ -25,10 +25,9 @@ from torch import Tensor
 from splatseg.core import FeatureSource, Gaussians, MaskSet, View
 from splatseg.core.models import GroundedMasks, Image
 from splatseg.errors import InputError
-from splatseg.lift.mass.features import checked_grid
-from splatseg.lift.mass.segment_masses import view_masses
-from splatseg.lift.relevancy import relevancy
-from splatseg.lift.vocabulary import Vocabulary
+from splatseg.lift.vocabulary import Vocabulary, relevancy
+from splatseg.lift.voting.features import checked_grid
+from splatseg.lift.voting.segment_masses import view_masses
 from splatseg.lift.words import (
     WordAnswers,
     answer_phrases,

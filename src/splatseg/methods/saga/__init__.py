@@ -31,7 +31,7 @@ from splatseg.lift.affinity import AffinityHead
 from splatseg.lift.decomposition.decompose import decompose
 from splatseg.lift.decomposition.options import DecomposeOptions
 from splatseg.methods._method import Method, MethodInputs
-from splatseg.methods._trained_labels import context_of
+from splatseg.methods._trained import context_of
 from splatseg.methods.saga._options import SHORT_STEPS
 from splatseg.methods.saga._options import SagaOptions as SagaOptions
 from splatseg.methods.saga._options import trained_as_published as trained_as_published

@@ -9,9 +9,9 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from splatseg.core import UNLABELLED
-from splatseg.lift.projector import project_features, projector_start
+from splatseg.lift.affinity import project_features, projector_start
 from splatseg.lift.training import Batch, Parameter, Values
-from splatseg.methods._label_models import linear_start
+from splatseg.methods._trained import linear_start
 from splatseg.methods.saga._association import OBJECT_END, PART_END, divisions, level_cut
 from splatseg.methods.saga._losses import (
     contrast_loss,

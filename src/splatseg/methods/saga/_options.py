@@ -9,7 +9,7 @@ from splatseg.errors import InputError, RangeError, quoted
 from splatseg.lift.decomposition.options import DecomposeOptions
 from splatseg.lift.training import Moving, Sampling, SamplingOptions, Schedule, TrainingOptions
 from splatseg.methods._method import ANY_COMPANION
-from splatseg.methods._trained_options import check_rate
+from splatseg.methods._trained import check_rate
 
 Correspondence = Literal["scale", "overlap", "none"]
 GateStart = Literal["levels", "steps", "random"]

@@ -9,9 +9,9 @@ from torch import Tensor
 
 from splatseg.core import FeatureSource, MaskSet, View
 from splatseg.errors import ShapeError
-from splatseg.lift.mass.adjoint import voting_views
-from splatseg.lift.mass.features import read_features_at
 from splatseg.lift.training import MaskSets, MaskTargets, PixelChoice, Ragged, Target, Targets
+from splatseg.lift.voting.features import read_features_at
+from splatseg.lift.voting.uplift import voting_views
 
 
 class KeptMasks:

@@ -20,9 +20,9 @@ from splatseg.core.boundary import boundary
 from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError
 from splatseg.lift.affinity import AffinityHead
-from splatseg.lift.mass.adjoint import voting_views
 from splatseg.lift.training import MaskSets, RowSampler, TrainingResult, train
-from splatseg.methods._trained_labels import TrainingContext, loss_curve
+from splatseg.lift.voting.uplift import voting_views
+from splatseg.methods._trained import TrainingContext, loss_curve
 from splatseg.methods.associate import associate_masks
 from splatseg.methods.saga._association import MaskSegments, association_start
 from splatseg.methods.saga._mask_table import MaskTable, mask_table
@@ -119,7 +119,6 @@ def train_saga(
         settings={"method": "saga"} | _settings(options),
         defaults=_settings(SagaOptions()),
         progress=context.progress,
-        cancelled=context.cancelled,
     )
     head = _head(options, masks, result.shared)
     return Features(

@@ -29,7 +29,7 @@ from splatseg.io.evidence import open_evidence
 from splatseg.io.npz_writing import save_arrays
 from splatseg.io.paths import path_inside
 from splatseg.lift import GaussianField
-from splatseg.lift.heads import ClassifierHead, has_classifier
+from splatseg.lift.label_maps import ClassifierHead, has_classifier
 from splatseg.tasks.benchmark.job import Job
 from splatseg.tasks.benchmark.sight import Seen, evidence_wanted
 from splatseg.tasks.benchmark.spoken import word_index, words_of

@@ -31,7 +31,7 @@ from splatseg.evaluate import (
 from splatseg.evaluate.frame_rate import TimedMaps, timed_label_maps
 from splatseg.evaluate.protocols import Protocol, RoomSwitches
 from splatseg.lift import GaussianField
-from splatseg.lift.heads import has_classifier
+from splatseg.lift.label_maps import has_classifier
 from splatseg.render import get_backend
 from splatseg.tasks.benchmark.class_names import ids_in_truth, room_table
 from splatseg.tasks.benchmark.job import Job
