@@ -33,7 +33,7 @@ from splatseg.core import Gaussians, LabelMap, Labels, MaskSet, Rle, Scene, View
 from splatseg.edit import load_document
 from splatseg.io.layers import save_layer
 from splatseg.io.scene import save_scene
-from splatseg.lift import label_map, uplift
+from splatseg.lift import complete, label_map, uplift
 from splatseg.methods.associate import associate
 from splatseg.methods.uplift import lift_labels
 from splatseg.render import render
@@ -129,7 +129,7 @@ def operation(name: str, doubles: str, made: Inputs, folder: Path) -> Callable[[
     if name == "uplift":
         return lambda: uplift(made.gaussians, made.views, made)
     if name == "segment":
-        return lambda: lift_labels(made.gaussians, made.views, made)
+        return lambda: complete(made.gaussians, lift_labels(made.gaussians, made.views, made))
     if name == "render":
         return lambda: [render(made.gaussians, view.camera) for view in made.views]
     if name == "export":

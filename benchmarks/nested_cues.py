@@ -202,7 +202,7 @@ def _held(tree: SegmentTree, table: SegmentTable, nested: Nesting, row: int) -> 
 def _cores(tree: SegmentTree, table: SegmentTable) -> list[NDArray[np.int64]]:
     """The Gaussians of which a node holds at least half of what its views see."""
     masses = table.masses(tree.node, np.ones(len(tree.node)))
-    squares = table.sights().power(2)
+    squares = table.visibility().power(2)
     had = np.zeros((len(table.views), len(tree.parent)))
     member = tree.node >= 0
     had[table.view[member], tree.node[member]] = 1
@@ -256,7 +256,6 @@ def main() -> None:
         scene.gaussians,
         scene.train_views,
         EvidenceSegments(evidence=open_evidence(arguments.data / arguments.evidence)),
-        max_views=options.max_views,
         longest_side=options.longest_side,
     )
     agreement = table.agreement()
@@ -268,7 +267,6 @@ def main() -> None:
         cluster(nested.agreement, options.agreement, conflicts=nested.conflicts),
         min_support=options.min_support,
         min_views=options.min_views,
-        overlap=options.overlap,
     )
     truth = node_truth(arguments.data, arguments.evidence, table, tree)
     score = np.array([table.score[tree.node == node].mean() for node in range(len(tree.parent))])

@@ -33,8 +33,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image
-from splatseg.methods.logits import LogitOptions, train_logits
-from splatseg.methods.probabilities import train_probabilities
 from street_field import peak
 from torch.utils.flop_counter import FlopCounterMode
 
@@ -120,11 +118,13 @@ def speed(arguments: argparse.Namespace) -> None:
         used, begin = cpu_seconds(), time.perf_counter()
         drawn = sampler.draw(rng, batch=arguments.batch)
         used, begin = cpu_seconds() - used, time.perf_counter() - begin
-        rows, entries = drawn.pixels, drawn.entries
+        views = drawn._store._views
+        rows = sum(len(view) for view in views)
+        entries = sum(len(view.rows.ids) for view in views)
         print(
             f"min_weight {min_weight}: {rows} rows in {begin:.1f} s ({used:.1f} s CPU), "
             f"{rows / used:.0f} rows a CPU second; {entries / rows:.0f} entries and "
-            f"{drawn.nbytes / rows:.0f} bytes a row"
+            f"{sum(view.nbytes for view in views) / rows:.0f} bytes a row"
         )
         step(drawn, len(scene.gaussians), arguments)
         drawn.close()
@@ -237,8 +237,6 @@ def methods(steps: int | None) -> dict[str, Callable[..., Features]]:
         "published": of(train_identity, IdentityOptions.published()),
         "features": of(train_identity, IdentityOptions(blend="features")),
         "identity": of(train_identity, IdentityOptions()),
-        "logits": of(train_logits, LogitOptions()),
-        "probabilities": of(train_probabilities, LogitOptions()),
     }
 
 

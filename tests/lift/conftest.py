@@ -1,4 +1,4 @@
-"""A small scene for lifting, its matrix W spelt out, and label maps in memory: `support.lifting`."""
+"""A small scene for lifting and label maps in memory, see `support.lifting`."""
 
 from support.backends import each_backend as each_backend
 from support.backends import pytest_generate_tests as pytest_generate_tests

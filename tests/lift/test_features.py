@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 
-import numpy as np
 import pytest
 import torch
 
@@ -96,7 +95,7 @@ def test_features_are_weighted_means(rng, lens, channels_at_once, monkeypatch) -
     info = found.info
     assert info.method == "uplift_features"
     assert info.views == ("v0", "v1")
-    assert info.options["norm"] == "none"
+    assert info.options == {"longest_side": None}
 
 
 def test_a_constant_stays_itself(rng, views) -> None:
@@ -130,34 +129,6 @@ def test_grids_that_do_not_divide_the_photograph() -> None:
     # Gaussians at columns 4.4 and 11.6, that is at 0.38 and 1.82 between cell centres.
     torch.testing.assert_close(both[0].flatten(), torch.tensor([0.38, 1.82]), rtol=0, atol=0.05)
     torch.testing.assert_close(both[1], both[0], rtol=0, atol=0.05)
-
-
-def test_each_view_may_be_normalised(rng, views) -> None:
-    gaussians = random_gaussians(rng)
-    grids = random_grids(rng, views)
-
-    def lift(norm: str, source: Grids) -> torch.Tensor:
-        options = FeatureUpliftOptions(norm=norm)  # type: ignore[arg-type]
-        return uplift_features(gaussians, views, source, options=options, backend=BACKEND).values
-
-    by_hand = {}
-    for norm in ("unit", "standard"):
-        maps = {}
-        for name, grid in grids.maps.items():
-            f = grid.features.numpy()
-            if norm == "unit":
-                f = f / np.linalg.norm(f, axis=-1, keepdims=True)
-            else:
-                f = (f - f.mean(axis=(0, 1))) / f.std(axis=(0, 1))
-            maps[name] = grid_of(torch.from_numpy(f), 4)
-        by_hand[norm] = Grids(maps)
-        torch.testing.assert_close(
-            lift(norm, grids), lift("none", by_hand[norm]), rtol=0, atol=1e-5
-        )
-    dull = {v.name: grid_of(torch.full((3, 4, 2), 0.1), 4) for v in views}
-    assert float(lift("standard", Grids(dull)).abs().max()) == 0
-    nothing = {v.name: grid_of(torch.zeros(3, 4, 2), 4) for v in views}
-    assert float(lift("unit", Grids(nothing)).abs().max()) == 0
 
 
 def test_unseen_gaussians_get_nothing() -> None:
@@ -210,10 +181,7 @@ def test_bad_input_is_refused(rng, views) -> None:
         uplift_features(gaussians, [], grids, backend=BACKEND)
     with pytest.raises(InputError, match="features of every view that votes, 1 of 1 have none"):
         uplift_features(gaussians, [View(name="x", camera=camera_at())], grids, backend=BACKEND)
-    for wrong in (
-        {"norm": "loud"},
-        {"longest_side": 0},
-    ):
+    for wrong in ({"longest_side": 0},):
         with pytest.raises(InputError, match=next(iter(wrong))):
             FeatureUpliftOptions(**wrong)
 

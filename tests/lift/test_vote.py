@@ -9,7 +9,7 @@ import torch
 from splatseg.core import Camera, ClassInfo, ClassTable, LabelMap, View
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.methods import vote as module
-from splatseg.methods.vote import VoteOptions, centre_weights, centres_in, majority_map, vote
+from splatseg.methods.vote import VoteOptions, centre_weights, centres_in, vote
 from splatseg.render import RenderOptions, prepare, weights
 
 from .conftest import (
@@ -198,24 +198,6 @@ def test_near_and_border() -> None:
     assert centres_in(means, camera, near=0.25).gaussians.tolist() == [0, 2]
 
 
-def test_regions_vote_for_their_commonest_id() -> None:
-    ids = torch.tensor([[1, 1, 2], [3, 2, 2], [-1, -1, -1]], dtype=torch.int32)
-    assert torch.equal(majority_map(ids, 0), ids)
-    # Counted by hand: corners have four pixels, edges six, the middle nine (three -1, three 2).
-    expected = torch.tensor([[1, 2, 2], [-1, -1, 2], [-1, -1, -1]], dtype=torch.int32)
-    assert torch.equal(majority_map(ids, 1), expected)
-    whole = torch.where(torch.rand(12, 16, generator=torch.Generator().manual_seed(1)) < 0.6, 7, 2)
-    assert bool((majority_map(whole, 20) == 7).all())
-    speck = halves(1, 2).ids.clone()
-    views, maps = votes_of(LabelMap(ids=speck))
-    gaussians = gaussians_at([LEFT])
-    column, row = views[0].camera.project(gaussians.means)[0][0].floor().long().tolist()
-    speck[row, column] = 9
-    maps = Maps({"v0": LabelMap(ids=speck)})
-    assert voted(gaussians, views, maps).ids.tolist() == [9]
-    assert voted(gaussians, views, maps, region=1).ids.tolist() == [1]
-
-
 def test_confidence_and_reduced_maps() -> None:
     sure = torch.full((12, 16), 0.9)
     views, maps = votes_of(
@@ -279,10 +261,7 @@ def test_bad_input_is_refused(rng, views) -> None:
     broken = gaussians.replace(means=torch.full_like(gaussians.means, math.nan))
     with pytest.raises(RangeError, match="means"):
         vote(broken, views[:2], maps, backend=BACKEND)
-    for wrong in (
-        {"share": 1.1},
-        {"region": -1},
-    ):
+    for wrong in ({"share": 1.1},):
         with pytest.raises(RangeError, match=next(iter(wrong))):
             VoteOptions(**wrong)
     for wrong in ({"rule": "most"}, {"occlusion": "x"}, {"weight": "two"}):

@@ -1,4 +1,4 @@
-r"""The network that takes 2D features into the space of Gaussians' features (SAGA, eq. 4).
+r"""Features that are compared (SAGA): the head that reads them, and its projector (eq. 4).
 
 Two hidden layers of 64, each a linear map, layer normalisation and a leaky ReLU, and a linear map:
 
@@ -26,6 +26,7 @@ from torch.nn.functional import layer_norm, leaky_relu, normalize
 from splatseg._check import check_finite, check_range, check_shape
 from splatseg.core import JSON, Features
 from splatseg.core.boundary import boundary, convert_fields
+from splatseg.core.options import Count, Share
 from splatseg.errors import InputError, RangeError, ShapeError
 
 HIDDEN = 64
@@ -94,17 +95,6 @@ def project_features(
     return found @ arrays["weight2"].T + arrays["bias2"]
 
 
-# A layer of features that tell which Gaussians belong together, and what reads them.
-#
-# Such features (SAGA's, `methods.saga`) have no classes: two of them are compared,
-#
-# .. math:: \cos\bigl(g(s) \odot f_i, \; g(s) \odot f_j\bigr), \qquad g(s) = \sigma(w s + b),
-#
-# where the gate g keeps the channels that matter at the scale s of what is looked for: 0 the
-# smallest things of the scene, 1 the largest. Scales mean the same in every scene: they are levels
-# (0 parts, 0.5 objects, 1 groups), or ranks of size: `AffinityHead.scale_of` has these of lengths.
-
-
 KIND = "affinity"
 """What tells this head from a classifier's in the info of a layer."""
 
@@ -114,9 +104,19 @@ QUANTILES = 101
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class AffinityHead:
-    """Reads features by comparing them."""
+    r"""Reads features by comparing them.
 
-    channels: int
+    Such features (SAGA's, `methods.saga`) have no classes: two of them are compared,
+
+    .. math:: \cos\bigl(g(s) \odot f_i, \; g(s) \odot f_j\bigr), \qquad g(s) = \sigma(w s + b),
+
+    where the gate g keeps the channels that matter at the scale s of what is looked for: 0 the
+    smallest things of the scene, 1 the largest. Scales mean the same in every scene: they are
+    levels (0 parts, 0.5 objects, 1 groups), or ranks of size: `AffinityHead.scale_of` has these of
+    lengths.
+    """
+
+    channels: Count
     """Width of a feature."""
 
     unit: bool
@@ -132,7 +132,7 @@ class AffinityHead:
     """Percentiles of the scales of masks, in scene units, ascending; None where none were
     measured, or scales are levels."""
 
-    levels: tuple[float, float, float] = (0.5, 0.5, 0.5)
+    levels: tuple[Share, Share, Share] = (0.5, 0.5, 0.5)
     """The scales, in [0, 1], that stand for groups, objects and their finest parts."""
 
     projector: Mapping[str, Tensor] = field(default_factory=dict[str, Tensor])
@@ -141,8 +141,6 @@ class AffinityHead:
 
     def __post_init__(self) -> None:
         convert_fields(self)
-        if self.channels < 1:
-            raise RangeError(f"channels: expected at least 1, got {self.channels}.")
         if (self.gate_weight is None) != (self.gate_bias is None):
             raise InputError("gate_weight, gate_bias: expected both or none of them.")
         for name in ("gate_weight", "gate_bias"):
@@ -154,8 +152,6 @@ class AffinityHead:
             check_finite("scale_quantiles", self.scale_quantiles)
             if bool((self.scale_quantiles.diff() < 0).any()):
                 raise RangeError("scale_quantiles: expected ascending numbers, got others.")
-        for scale in self.levels:
-            check_range("levels", scale, 0.0, 1.0)
         if self.projector:
             _check_projector(self.projector, self.channels)
 

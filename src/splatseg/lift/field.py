@@ -1,6 +1,9 @@
-"""Kinds of layers over Gaussians, each read in views and at points in its own way."""
+"""Gaussians with their layers as a field: `splatseg.core.Renderable`.
 
-from abc import ABC, abstractmethod
+A view is projected and sorted once (`splatseg.render.prepare`); colour, depth and all layers of the
+view are products with it, each exactly what `render` and `label_map` give on their own.
+"""
+
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from types import TracebackType
@@ -9,7 +12,6 @@ from typing import Literal, Self
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from typing_extensions import override
 
 from splatseg.core import (
     UNLABELLED,
@@ -19,7 +21,6 @@ from splatseg.core import (
     LabelMap,
     Labels,
     Layer,
-    LayerInfo,
     PointLabels,
     RenderableLayer,
     Selection,
@@ -42,28 +43,77 @@ head's way, `ClassifierHead.label_map`."""
 _READOUTS = ("hard", "rendered")
 
 
-class FieldLayer(ABC):
-    """A layer of a field of Gaussians."""
+class FieldLayer:
+    """A layer of a field of Gaussians, read in views and at points.
+
+    It is labels, a selection, or features, which are read by their classifier if they have one.
+
+    Args:
+        name: What errors call it.
+        layer: The layer.
+    """
+
+    def __init__(self, name: str, layer: Labels | Selection | Features | VoxelFeatures) -> None:
+        self._name = name
+        self._layer = layer
+        self._head: ClassifierHead | None = None
+        if isinstance(layer, Features) and has_classifier(layer):
+            self._head = ClassifierHead.of(layer)
 
     @property
-    @abstractmethod
     def summary(self) -> RenderableLayer:
         """What there is to know of it."""
+        if self._head is not None:
+            return RenderableLayer(
+                ids=tuple(sorted(set(self._head.ids.tolist()))),
+                background=self._head.background,
+                info=self._layer.info,
+            )
+        if isinstance(self._layer, (Labels, Selection)):
+            return RenderableLayer.of(self._layer)
+        return RenderableLayer(kind="features", info=self._layer.info)
 
-    @property
-    @abstractmethod
+    @cached_property
     def labels(self) -> Labels:
-        """Labels of Gaussians."""
+        """Labels of Gaussians: of features the hard readout.
 
-    @abstractmethod
+        Raises:
+            InputError: If they are features without a classifier.
+        """
+        match self._layer:
+            case Labels():
+                return self._layer
+            case Selection():
+                return selection_labels(self._layer)
+            case Features() if self._head is not None:
+                recorded = self._layer.info.options.get("min_share")
+                least = float(recorded) if isinstance(recorded, int | float) else 0.0
+                return self._head.labels(self._layer, min_share=least)
+            case _:
+                raise InputError(
+                    f"layer {self._name!r}: expected labels, a selection, or features with a "
+                    "classifier, got features without one, which have no label maps."
+                )
+
+    @cached_property
+    def _log_totals(self) -> Tensor | None:
+        head = self._head
+        if head is None or head.blend != "probabilities" or not isinstance(self._layer, Features):
+            return None
+        return head.log_totals(self._layer)
+
     def features(self, view: ViewRenderer) -> Float[Tensor, "height width channels"]:
         """Its features, blended in a view."""
+        if isinstance(self._layer, (Labels, Selection)):
+            raise InputError(f"layer {self._name!r}: expected features, got labels.")
+        return view.scores(plain_features(self._layer).values)[0]
 
-    @abstractmethod
     def label_map(self, view: ViewRenderer) -> LabelMap:
         """Its ids in a view."""
+        if self._head is None or not isinstance(self._layer, Features):
+            return view_label_map(view.view, self.labels)
+        return self._head.view_label_map(view, self._layer, log_totals=self._log_totals)
 
-    @abstractmethod
     def confidence(
         self, view: ViewRenderer, shown: LabelMap
     ) -> tuple[Float[Tensor, "height width"], Float[Tensor, "height width"]]:
@@ -73,12 +123,20 @@ class FieldLayer(ABC):
             view: The view.
             shown: The label map there.
         """
+        if self._head is not None:
+            alpha = view.scores(torch.zeros(len(self._layer), 1))[1]
+            return alpha if shown.confidence is None else shown.confidence, alpha
+        # The mean over the Gaussians that a pixel shows, by their weights.
+        sums, alpha = view.scores(self.labels.confidence[:, None])
+        return (sums[..., 0] / alpha.clamp_min(1e-6)).clamp(0, 1), alpha
 
-    @abstractmethod
     def labels_at(
         self, gaussians: Gaussians, points: Float[Tensor, "p 3"], options: PointLabelOptions
     ) -> PointLabels:
         """Its labels of points."""
+        if self._head is None or not isinstance(self._layer, Features):
+            return labels_of_points(gaussians, self.labels.ids, points, options=options)
+        return classified_points(gaussians, self._layer, self._head, points, options=options)
 
 
 def field_layer(layers: Mapping[str, Layer], address: str) -> FieldLayer:
@@ -92,16 +150,19 @@ def field_layer(layers: Mapping[str, Layer], address: str) -> FieldLayer:
     if layer is None:
         known = ", ".join(layers) or "there is none"
         raise InputError(f"layer: expected one of the field ({known}), got {name!r}.")
-    if isinstance(layer, Features):
-        return _of_features(name, layer, part if at else "rendered")
     if isinstance(layer, VoxelFeatures):
-        return _PlainFeatures(name, layer)
-    flat = flat_layer(layer, tree_level(part) if at else None, name=name)
-    if isinstance(flat, Features):
-        return _of_features(name, flat, "rendered")
-    if isinstance(flat, VoxelFeatures):
-        return _PlainFeatures(name, flat)
-    return _LabelLayer(name, flat)
+        return FieldLayer(name, layer)
+    if not isinstance(layer, Features):
+        return FieldLayer(name, flat_layer(layer, tree_level(part) if at else None, name=name))
+    if at and part not in _READOUTS:
+        raise InputError(
+            f"layer {name!r}: expected a readout of features after the @ "
+            f"({', '.join(_READOUTS)}), got {part!r}."
+        )
+    found = FieldLayer(name, layer)
+    if part == "hard" and has_classifier(layer):
+        return FieldLayer(name, found.labels)
+    return found
 
 
 def selection_labels(selection: Selection) -> Labels:
@@ -121,161 +182,6 @@ def selection_labels(selection: Selection) -> Labels:
         shares=shares.unsqueeze(1),
         info=selection.info,
     )
-
-
-def _of_features(name: str, layer: Features, readout: str) -> FieldLayer:
-    if readout not in _READOUTS:
-        raise InputError(
-            f"layer {name!r}: expected a readout of features after the @ "
-            f"({', '.join(_READOUTS)}), got {readout!r}."
-        )
-    if not has_classifier(layer):
-        return _PlainFeatures(name, layer)
-    trained = _TrainedLayer(layer)
-    return _LabelLayer(name, trained.labels) if readout == "hard" else trained
-
-
-class _LabelLayer(FieldLayer):
-    """Labels, or a selection as the label 1."""
-
-    def __init__(self, name: str, layer: Labels | Selection) -> None:
-        self._name = name
-        self._summary = RenderableLayer.of(layer)
-        self._labels = layer if isinstance(layer, Labels) else selection_labels(layer)
-
-    @property
-    @override
-    def summary(self) -> RenderableLayer:
-        return self._summary
-
-    @property
-    @override
-    def labels(self) -> Labels:
-        return self._labels
-
-    @override
-    def features(self, view: ViewRenderer) -> Tensor:
-        raise InputError(f"layer {self._name!r}: expected features, got labels.")
-
-    @override
-    def label_map(self, view: ViewRenderer) -> LabelMap:
-        return view_label_map(view.view, self._labels)
-
-    @override
-    def confidence(self, view: ViewRenderer, shown: LabelMap) -> tuple[Tensor, Tensor]:
-        # The mean over the Gaussians that a pixel shows, by their weights.
-        sums, alpha = view.scores(self._labels.confidence[:, None])
-        return (sums[..., 0] / alpha.clamp_min(1e-6)).clamp(0, 1), alpha
-
-    @override
-    def labels_at(
-        self, gaussians: Gaussians, points: Tensor, options: PointLabelOptions
-    ) -> PointLabels:
-        return labels_of_points(gaussians, self._labels.ids, points, options=options)
-
-
-class _TrainedLayer(FieldLayer):
-    """Features with their classifier, by its own readout."""
-
-    def __init__(self, features: Features) -> None:
-        self._features = features
-        self._head = ClassifierHead.of(features)
-
-    @property
-    @override
-    def summary(self) -> RenderableLayer:
-        return RenderableLayer(
-            ids=tuple(sorted(set(self._head.ids.tolist()))),
-            background=self._head.background,
-            info=self._features.info,
-        )
-
-    @cached_property
-    def _hard(self) -> Labels:
-        return self._head.labels(self._features, min_share=_min_share(self._features.info))
-
-    @cached_property
-    def _log_totals(self) -> Tensor:
-        return self._head.log_totals(self._features)
-
-    @property
-    @override
-    def labels(self) -> Labels:
-        return self._hard
-
-    @override
-    def features(self, view: ViewRenderer) -> Tensor:
-        return view.scores(self._features.values)[0]
-
-    @override
-    def label_map(self, view: ViewRenderer) -> LabelMap:
-        totals = self._log_totals if self._head.blend == "probabilities" else None
-        return self._head.view_label_map(view, self._features, log_totals=totals)
-
-    @override
-    def confidence(self, view: ViewRenderer, shown: LabelMap) -> tuple[Tensor, Tensor]:
-        alpha = view.scores(torch.zeros(len(self._features), 1))[1]
-        return alpha if shown.confidence is None else shown.confidence, alpha
-
-    @override
-    def labels_at(
-        self, gaussians: Gaussians, points: Tensor, options: PointLabelOptions
-    ) -> PointLabels:
-        return classified_points(gaussians, self._features, self._head, points, options=options)
-
-
-class _PlainFeatures(FieldLayer):
-    """Features that nobody knows how to read."""
-
-    def __init__(self, name: str, features: Features | VoxelFeatures) -> None:
-        self._name = name
-        self._features = features
-
-    @property
-    @override
-    def summary(self) -> RenderableLayer:
-        return RenderableLayer(kind="features", info=self._features.info)
-
-    @property
-    @override
-    def labels(self) -> Labels:
-        raise self._error()
-
-    @override
-    def features(self, view: ViewRenderer) -> Tensor:
-        return view.scores(plain_features(self._features).values)[0]
-
-    @override
-    def label_map(self, view: ViewRenderer) -> LabelMap:
-        raise self._error()
-
-    @override
-    def confidence(self, view: ViewRenderer, shown: LabelMap) -> tuple[Tensor, Tensor]:
-        raise self._error()
-
-    @override
-    def labels_at(
-        self, gaussians: Gaussians, points: Tensor, options: PointLabelOptions
-    ) -> PointLabels:
-        raise self._error()
-
-    def _error(self) -> InputError:
-        return InputError(
-            f"layer {self._name!r}: expected labels, a selection, or features with a classifier, "
-            "got features without one, which have no label maps."
-        )
-
-
-def _min_share(info: LayerInfo) -> float:
-    """The least probability that the training's options ask of a hard label; 0 if they do not."""
-    recorded = info.options.get("min_share")
-    return float(recorded) if isinstance(recorded, int | float) else 0.0
-
-
-# Gaussians with their layers as a field: `splatseg.core.Renderable`.
-#
-# A view is projected and sorted once (`splatseg.render.prepare`); colour, depth and all layers of
-# the view are products with it, each exactly what `render` and `label_map` give on their own.
 
 
 _COVERED = 0.02

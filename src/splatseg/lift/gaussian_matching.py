@@ -1,4 +1,4 @@
-"""Attributes of Gaussians by which rows of one scene are matched with another's."""
+"""Rows of one scene matched with those of another: their attributes, and the matching."""
 
 from collections.abc import Generator
 from dataclasses import dataclass, replace
@@ -99,19 +99,6 @@ def extent_of(rows: Rows) -> float:
     return wide if wide > 0 else max(float(np.abs(rows.means).max()), 1e-6)
 
 
-# Which row of a scene each row of an edited copy is, once both lie in the same frame.
-#
-# Candidates are the nearest centres. A candidate's cost adds up what position, colour, opacity,
-# sizes and orientation differ by, each in units of the noise that the data themselves show:
-#
-# .. math:: c = \sum_a d_a \log\bigl(1 + (r_a / \sigma_a)^2\bigr)
-#
-# with d_a the number of values. The logarithm keeps one attribute that an editor changed (a tint)
-# from outweighing the others. Rows and candidates are then paired so that no row and candidate
-# would both rather have each other than what they got (Gale and Shapley 1962), ties to the lower
-# row: rows that are equal in everything keep their order.
-
-
 NEAREST = 8
 """Candidates of a row at first."""
 
@@ -165,7 +152,17 @@ class Matches:
 
 
 def match(edited: Rows, source: Rows, *, free: NDArray[np.bool_] | None = None) -> Matches:
-    """Find edited rows among source rows that lie in the same place.
+    r"""Find edited rows among source rows that lie in the same place.
+
+    Candidates are the nearest centres. A candidate's cost adds up what position, colour, opacity,
+    sizes and orientation differ by, each in units of the noise that the data themselves show:
+
+    .. math:: c = \sum_a d_a \log\bigl(1 + (r_a / \sigma_a)^2\bigr)
+
+    with d_a the number of values. The logarithm keeps one attribute that an editor changed (a tint)
+    from outweighing the others. Rows and candidates are then paired so that no row and candidate
+    would both rather have each other than what they got (Gale and Shapley 1962), ties to the lower
+    row: rows that are equal in everything keep their order.
 
     Args:
         edited: What is looked for.

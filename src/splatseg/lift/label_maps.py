@@ -1,4 +1,4 @@
-"""One signal after another rendered in a prepared view, and read on the CPU."""
+"""Label maps of layers in views: of labels, and of features with their classifier."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -54,19 +54,6 @@ class ViewRenderer:
         return rendered.image.float().cpu(), rendered.alpha.float().cpu()
 
 
-# From a layer of labels to the label map of a view.
-#
-# A pixel's id is the one with the largest blending weight:
-#
-# .. math:: s_c(p) = \sum_i w_{pi}\, a_{ic} + [c = b] \Bigl(1 - \sum_i w_{pi}\Bigr), \qquad
-#           \mathrm{id}(p) = \arg\max_c s_c(p)
-#
-# where :math:`a_{ic}` is 1 for the label of Gaussian i and 0 else (a hard layer), or its share of
-# the evidence (a soft layer). No label, -1, competes as one more id: a hard layer's unlabelled
-# Gaussians stand for it, a soft layer's missing shares. The transmittance behind all Gaussians
-# stands for the layer's background label b, and for no label where it has none.
-
-
 @boundary
 def label_map(
     gaussians: Gaussians,
@@ -76,7 +63,17 @@ def label_map(
     options: RenderOptions | None = None,
     backend: str = "auto",
 ) -> LabelMap:
-    """The label map that a layer has in a view, in the pixels of any camera.
+    r"""The label map that a layer has in a view, in the pixels of any camera.
+
+    A pixel's id is the one with the largest blending weight:
+
+    .. math:: s_c(p) = \sum_i w_{pi}\, a_{ic} + [c = b] \Bigl(1 - \sum_i w_{pi}\Bigr), \qquad
+              \mathrm{id}(p) = \arg\max_c s_c(p)
+
+    where :math:`a_{ic}` is 1 for the label of Gaussian i and 0 else (a hard layer), or its share of
+    the evidence (a soft layer). No label, -1, competes as one more id: a hard layer's unlabelled
+    Gaussians stand for it, a soft layer's missing shares. The transmittance behind all Gaussians
+    stands for the layer's background label b, and for no label where it has none.
 
     One pass, whose time and memory do not grow with the number of ids (`PreparedView.argmax`).
     Ties go to the smaller id, and -1 loses every tie. With lens distortion a pixel of the
@@ -137,18 +134,6 @@ def _indices(of: Tensor, ids: Int64[Tensor, "m"]) -> Tensor:
     return torch.where(of == UNLABELLED, len(ids) - 1, found).to(torch.int32)
 
 
-# A layer of features with the classifier that reads it: labels of Gaussians and of views.
-#
-# There are two ways from features :math:`f_i` to the ids of a pixel (`ClassifierHead.blend`):
-# render the features and classify what is seen, or classify every Gaussian and render that,
-#
-# .. math:: \arg\max_c \; \Bigl(A \sum_i w_{pi} f_i + b\Bigr)_c \qquad \text{or} \qquad
-#           \arg\max_c \sum_i w_{pi} \, \mathrm{softmax}(A f_i + b)_c .
-#
-# Sums of logits are unbounded: one Gaussian that is very sure outvotes all others of a pixel.
-# Probabilities are not.
-
-
 Blend = Literal["features", "probabilities"]
 _ROWS = 65536
 """Gaussians classified at a time."""
@@ -158,7 +143,17 @@ _CHANNELS = 32
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ClassifierHead:
-    """Reads ids out of features."""
+    r"""Reads ids out of features.
+
+    There are two ways from features :math:`f_i` to the ids of a pixel (`ClassifierHead.blend`):
+    render the features and classify what is seen, or classify every Gaussian and render that,
+
+    .. math:: \arg\max_c \; \Bigl(A \sum_i w_{pi} f_i + b\Bigr)_c \qquad \text{or} \qquad
+              \arg\max_c \sum_i w_{pi} \, \mathrm{softmax}(A f_i + b)_c .
+
+    Sums of logits are unbounded: one Gaussian that is very sure outvotes all others of a pixel.
+    Probabilities are not.
+    """
 
     ids: Int64[Tensor, "classes"]
     """The id of each class."""

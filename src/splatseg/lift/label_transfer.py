@@ -1,10 +1,15 @@
-"""The similarity that an editor moved a scene, or a part of it, by.
+"""Label transfer: labels find their Gaussians again after an editor changed the file.
 
-Opacity, mean colour and the ratios of the three scales do not change under a similarity. Edited
-rows are paired with the source rows that are nearest in these; the log of the ratio of their
-sizes is the log of the similarity's scale, which most right pairs share and wrong ones do not.
-Of the pairs that are left, three make a similarity (Umeyama 1991); the one with most inliers is
-refined on them (RANSAC).
+An editor may drop the columns it does not know, reorder rows, crop, move the scene or a part of
+it, duplicate a part, tint it, or round values on the way into a compressed format.
+`match_gaussians` finds which row of the scene each row of the edited file is;
+`GaussianMatches.transfer` takes layers along.
+
+The similarity that a scene, or a part of it, was moved by: opacity, mean colour and the ratios of
+the three scales do not change under it. Edited rows are paired with the source rows that are
+nearest in these; the log of the ratio of their sizes is the log of the similarity's scale, which
+most right pairs share and wrong ones do not. Of the pairs that are left, three make a similarity
+(Umeyama 1991); the one with most inliers is refined on them (RANSAC).
 """
 
 from collections.abc import Mapping
@@ -188,13 +193,6 @@ def _residuals(move: Similarity, origin: Floats, target: Floats) -> Floats:
     return np.linalg.norm(moved - target, axis=1)
 
 
-# Re-attachment: labels are carried onto Gaussians that an editor changed.
-#
-# An editor may drop the columns it does not know, reorder rows, crop, move the scene or a part of
-# it, duplicate a part, tint it, or round values on the way into a compressed format. `match_gaussians`
-# finds which row of the scene each row of the edited file is; `GaussianMatches.transfer` takes layers along.
-
-
 _Layer = TypeVar("_Layer", bound=Layer)
 
 _ROUNDS = 3
@@ -372,7 +370,9 @@ class _Search:
         if found is None:
             return False
         min_found = min(_MIN_PART, len(self._edited))
-        return self._match_left(_move(found), min_found=min_found, copies=free is None)
+        return self._match_left(
+            (found.edited_from_source, found.mirrored), min_found=min_found, copies=free is None
+        )
 
     def _match_left(
         self, move: tuple[Similarity, bool], *, min_found: float, copies: bool = False
@@ -462,10 +462,6 @@ class _Search:
         )
 
 
-def _move(found: Hypothesis) -> tuple[Similarity, bool]:
-    return found.edited_from_source, found.mirrored
-
-
 def _mirror(mirrored: bool) -> NDArray[np.float64]:
     return np.array([-1.0 if mirrored else 1.0, 1.0, 1.0])
 
@@ -493,40 +489,32 @@ def _described(move: Move, noise: list[float]) -> dict[str, Any]:
     }
 
 
+_COLUMNS: dict[type[Any], tuple[str, ...]] = {
+    Labels: (
+        "ids", "confidence", "candidates", "shares", "evidence", "effective_views", "inferred",
+    ),
+    Features: ("values", "weights"),
+    VoxelFeatures: ("rows", "shares"),
+    Selection: ("mask", "confidence"),
+}  # fmt: skip
+"""What layers have of each Gaussian."""
+
+
 def _transferred(layer: Layer, rows: Tensor) -> Layer:
-    """The layer's rows in a new order, blank where there is none."""
-    match layer:
-        case Labels():
-            return replace(
-                layer,
-                ids=_gathered(layer.ids, rows, UNLABELLED),
-                confidence=_gathered(layer.confidence, rows, 0.0),
-                candidates=_gathered_if(layer.candidates, rows, UNLABELLED),
-                shares=_gathered_if(layer.shares, rows, 0.0),
-                evidence=_gathered_if(layer.evidence, rows, 0.0),
-                effective_views=_gathered_if(layer.effective_views, rows, 0.0),
-                inferred=_gathered_if(layer.inferred, rows, False),  # noqa: FBT003  (a value)
-            )
-        case Features():
-            return replace(
-                layer,
-                values=_gathered(layer.values, rows, 0.0),
-                weights=_gathered_if(layer.weights, rows, 0.0),
-            )
-        case VoxelFeatures():
-            return replace(
-                layer,
-                rows=_gathered(layer.rows, rows, UNLABELLED),
-                shares=_gathered_if(layer.shares, rows, 0.0),
-            )
-        case Selection():
-            return replace(
-                layer,
-                mask=_gathered(layer.mask, rows, False),  # noqa: FBT003  (a value)
-                confidence=_gathered_if(layer.confidence, rows, 0.0),
-            )
-        case InstanceTree():
-            return replace(layer, labels=cast("Labels", _transferred(layer.labels, rows)))
+    """The layer's rows in a new order; where there is none -1, 0 or false."""
+    if isinstance(layer, InstanceTree):
+        return replace(layer, labels=cast("Labels", _transferred(layer.labels, rows)))
+    columns: dict[str, Tensor | None] = {n: getattr(layer, n) for n in _COLUMNS[type(layer)]}
+    moved = {
+        name: _gathered(column, rows, UNLABELLED if _is_integer(column) else 0)
+        for name, column in columns.items()
+        if column is not None
+    }
+    return replace(layer, **cast("dict[str, Any]", moved))
+
+
+def _is_integer(column: Tensor) -> bool:
+    return not column.dtype.is_floating_point and column.dtype != torch.bool
 
 
 def _gathered(column: Tensor, rows: Tensor, fill: float) -> Tensor:
@@ -534,7 +522,3 @@ def _gathered(column: Tensor, rows: Tensor, fill: float) -> Tensor:
     found = rows >= 0
     out[found] = column[rows[found]]
     return out
-
-
-def _gathered_if(column: Tensor | None, rows: Tensor, fill: float) -> Tensor | None:
-    return None if column is None else _gathered(column, rows, fill)

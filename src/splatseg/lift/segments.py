@@ -1,4 +1,4 @@
-"""Recorded evidence as segments of views."""
+"""Segments of views: recorded evidence, on a coarser grid, and with the ids of a layer."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -8,7 +8,6 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from splatseg._check import check_range
 from splatseg.core import (
     UNLABELLED,
     Gaussians,
@@ -21,6 +20,7 @@ from splatseg.core import (
     camera_of_map,
 )
 from splatseg.core.boundary import convert_fields
+from splatseg.core.options import Share
 from splatseg.errors import InputError, ShapeError
 from splatseg.io.evidence import Evidence, PanopticEvidence, TrackedEvidence
 from splatseg.lift.label_maps import label_map
@@ -83,9 +83,6 @@ class EvidenceSegments:
         return {track.id: ids[track.category] for track in evidence.tracks if track.category in ids}
 
 
-# Segments on a coarser grid.
-
-
 def reduced_segments(segments: LabelMap | MaskSet, longest: int) -> LabelMap | MaskSet:
     """Segments on a coarser grid: each pixel takes what is at its middle."""
     height, width = segments.height, segments.width
@@ -105,21 +102,18 @@ def reduced_segments(segments: LabelMap | MaskSet, longest: int) -> LabelMap | M
     return replace(segments, height=h, width=w, masks=masks)
 
 
-# Label maps that a layer and the segments of its evidence make together.
-#
-# Segments have the boundaries that were seen, but ids of their view's own; a layer has ids that
-# mean the same in all views, but boundaries that are as good as its Gaussians. Drawn in a view,
-# the layer tells which of its ids each segment shows: the one with which it has the largest
-#
-# .. math:: \mathrm{IoU}(s, k) = \frac{|s \cap k|}{|s \cup k|}
-#
-# over the view's pixels. A segment that fits none by at least `min_overlap` says nothing, so
-# what the model got wrong in this view, or what the layer does not have, is left out.
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MatchedMaps:
-    """A layer's ids with the boundaries of segments: a `LabelSource`.
+    r"""A layer's ids with the boundaries of segments: a `LabelSource`.
+
+    Segments have the boundaries that were seen, but ids of their view's own; a layer has ids that
+    mean the same in all views, but boundaries that are as good as its Gaussians. Drawn in a view,
+    the layer tells which of its ids each segment shows: the one with which it has the largest
+
+    .. math:: \mathrm{IoU}(s, k) = \frac{|s \cap k|}{|s \cup k|}
+
+    over the view's pixels. A segment that fits none by at least `min_overlap` says nothing, so
+    what the model got wrong in this view, or what the layer does not have, is left out.
 
     Maps are made when they are asked for and not kept.
 
@@ -136,7 +130,7 @@ class MatchedMaps:
     labels: Labels
     """The layer whose ids the segments take."""
 
-    min_overlap: float = 0.2
+    min_overlap: Share = 0.2
     """Intersection over union, in [0, 1], that a segment must have with what the layer shows,
     the same that joins segments (`AssociateOptions.agreement`)."""
 
@@ -148,7 +142,6 @@ class MatchedMaps:
 
     def __post_init__(self) -> None:
         convert_fields(self)
-        check_range("min_overlap", self.min_overlap, 0.0, 1.0)
         if len(self.labels) != len(self.gaussians):
             raise ShapeError(
                 f"labels: expected {len(self.gaussians)} rows, one a Gaussian, "

@@ -1,4 +1,4 @@
-r"""Features in the space of words: cosines with words, and how relevant a word is.
+r"""Words for features: their space, cosines, relevancy, and vectors of words.
 
 The relevancy of a word with the vector t for features f (Kerr et al. 2023, LERF, section 3.4) is
 its softmax against each of some canonical words n, the least of them:
@@ -133,9 +133,6 @@ def relevancy(
     check_finite("cosines", cosines)
     check_finite("negatives", negatives)
     return torch.sigmoid(temperature * (cosines - negatives.amax(dim=-1, keepdim=True)))
-
-
-# Words for features: vectors that a model makes of any words, or those recorded of some.
 
 
 _SUGGESTIONS = 3

@@ -50,7 +50,7 @@ class LabelTrainingOptions(RowTrainingOptions):
     classifier that reads it, by which views are rendered first and decided then."""
 
     min_share: Share = 0.0
-    """Minimum probability, in [0, 1], of a Gaussian's most likely id; below it there is no label."""
+    """Minimum probability, in [0, 1], of a Gaussian's id; below it there is no label."""
 
 
 def check_rate(name: str, value: float) -> None:

@@ -17,8 +17,6 @@ A centre is seen through whatever hides it, unless the occlusion test is asked f
 References:
     Hu et al., Semantic Anything in 3D Gaussians (SA-GS / SAGD, 2024), section 4.3: more than
     0.7 of all views. Prompt SA-GS (2024), eq. 7 and 8: more than 0.6 of them.
-    Yan et al., Street Gaussians (2024), as read into points by the mesh-based street field:
-    regions around centres vote.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,7 +24,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Literal
 
 import torch
-from jaxtyping import Float, Int, Int64
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 from splatseg.core import (
@@ -41,7 +39,7 @@ from splatseg.core import (
     View,
     camera_of_map,
 )
-from splatseg.core.options import Natural, Share, options
+from splatseg.core.options import Share, options
 from splatseg.errors import InputError
 from splatseg.lift.voting.uplift import names_of, voting_views
 from splatseg.lift.voting.votes import SLOTS, VoteTable
@@ -130,40 +128,6 @@ def centre_weights(
     return centre_weight[centres.gaussians]
 
 
-def majority_map(ids: Int[Tensor, "height width"], radius: int) -> Int[Tensor, "height width"]:
-    """The commonest id in the square around each pixel, -1 among them, ties to the smaller id.
-
-    The square is cut at the border of the image.
-    """
-    if radius == 0:
-        return ids
-    best = torch.full(ids.shape, -1.0)
-    winner = torch.full_like(ids, UNLABELLED)
-    for id in torch.unique(ids).tolist():
-        cumulative = (ids == id).double().cumsum(0).cumsum(1)
-        count = _square_sums(cumulative, radius)
-        better = count > best
-        best = torch.where(better, count, best.to(count))
-        winner[better] = id
-    return winner
-
-
-def _square_sums(sums: Float[Tensor, "height width"], radius: int) -> Tensor:
-    """Sums over squares, from cumulative sums along both axes."""
-    height, width = sums.shape
-    padded = torch.zeros(height + 1, width + 1, dtype=sums.dtype)
-    padded[1:, 1:] = sums
-    row, column = torch.arange(height), torch.arange(width)
-    top, bottom = (row - radius).clamp_min(0), (row + radius + 1).clamp_max(height)
-    left, right = (column - radius).clamp_min(0), (column + radius + 1).clamp_max(width)
-    return (
-        padded[bottom][:, right]
-        - padded[top][:, right]
-        - padded[bottom][:, left]
-        + padded[top][:, left]
-    )
-
-
 VoteRule = Literal["visible", "published"]
 VoteOcclusion = Literal["none", "depth", "weight"]
 VoteWeight = Literal["one", "transmittance"]
@@ -186,6 +150,7 @@ _MEMORY = 1 << 30
         "min_weight": "a Gaussian is seen where its blending weight is 0.01 or more",
         "count_void": "label the pixels outside an object with an id of their own",
         "candidates": "method uplift makes soft layers",
+        "region": "the pixel of the centre decides alone",
         "memory": "the table of votes is exact up to 1 GiB",
     }
 )
@@ -208,10 +173,6 @@ class VoteOptions:
     weight: VoteWeight = "one"
     """What a view's vote counts. transmittance: the Gaussian's blending weight at the pixel of
     its centre, its opacity there times the transmittance before it."""
-
-    region: Natural = 0
-    """Pixels on each side of the centre's pixel that decide with it: the vote is for the
-    commonest id of the square. 0 is the pixel alone."""
 
     @property
     def needed_share(self) -> float:
@@ -325,7 +286,7 @@ class _CentreVoter:
             vote_weight = weight
         if label_map.confidence is not None:
             vote_weight = vote_weight * label_map.confidence.cpu().float()[row, column]
-        ids = majority_map(label_map.ids.cpu(), self.options.region)
+        ids = label_map.ids.cpu()
         return _ViewVotes(
             gaussians=centres.gaussians, ids=ids[row, column].long(), weights=vote_weight
         )

@@ -4,7 +4,7 @@ Refining, filling holes and completing a selection all ask which Gaussians are n
 alike they are, and whether they touch. For a scene of 400 k Gaussians that takes seconds to find
 and milliseconds to look up, so a session builds a `NeighbourGraph` when the scene opens.
 
-Strengths are those of `lift.completion.graph`: distance, colour, normal and, where there are
+Strengths are those of `lift.neighbour_graph`: distance, colour, normal and, where there are
 any, features. Two Gaussians touch as in `selection.components`.
 """
 

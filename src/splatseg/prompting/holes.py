@@ -8,7 +8,7 @@ scene.
 
 A *hidden* Gaussian is one that no view explains: it lies inside or behind things. Its membership
 is the share of random walks over the neighbour graph that first meet evidence inside, among those
-that meet any, as in `lift.completion.complete`,
+that meet any, as in `lift.completion`,
 
 .. math:: (a_i, b_i) \leftarrow \sum_j P_{ij} (a_j, b_j), \qquad P = D^{-1} W, \qquad
           p_i = \frac{a_i}{a_i + b_i}

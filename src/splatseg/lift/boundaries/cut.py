@@ -340,12 +340,12 @@ def sides_of(
     .. math:: A_i = \sum_{views} \sum_{p \in A} w_{pi}, \qquad
               c^A_i = \frac{\sum_{p \in A} w_{pi} x_p}{\sum_{p \in A} w_{pi}}
 
-    with x the pixel's position on the plane z = 1 of a view. In that view the Gaussian is a 2D normal
-    distribution of covariance :math:`S = J \Sigma J^\top + \epsilon`, and the line that separates
-    two groups of its pixels best has the normal :math:`S^{-1} (c^A - c^B)` (Fisher's discriminant).
-    The plane through the camera and that line, pulled back into the Gaussian's own frame, is
-    :math:`L^\top J^\top S^{-1} (c^A - c^B)`. Views add up with the weight
-    :math:`A B / (A + B)` of a difference of two means:
+    with x the pixel's position on the plane z = 1 of a view. In that view the Gaussian is a 2D
+    normal distribution of covariance :math:`S = J \Sigma J^\top + \epsilon`, and the line that
+    separates two groups of its pixels best has the normal :math:`S^{-1} (c^A - c^B)` (Fisher's
+    discriminant). The plane through the camera and that line, pulled back into the Gaussian's own
+    frame, is :math:`L^\top J^\top S^{-1} (c^A - c^B)`. Views add up with the weight :math:`A B / (A
+    + B)` of a difference of two means:
 
     .. math:: g_i = \sum_{views} \frac{A B}{A + B}\, L^\top J^\top S^{-1} (c^A - c^B)
 

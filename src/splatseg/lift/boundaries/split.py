@@ -1,4 +1,4 @@
-r"""Gaussians seen by cameras, in each Gaussian's own frame.
+r"""Splits of Gaussians, and how cameras see them, in each Gaussian's own frame.
 
 A Gaussian is the image of the unit ball's distribution under :math:`x = \mu + L z` with
 :math:`L = R\,\mathrm{diag}(s)`. A direction e of length 1 in z is a line through the Gaussian
@@ -159,38 +159,6 @@ def _sphere_directions() -> Tensor:
     return torch.stack((ring * torch.cos(angle), ring * torch.sin(angle), z), dim=-1)
 
 
-# A normal distribution as a few narrower ones, and the opacities that look like one.
-#
-# **Offsets, widths and weights.** The standard normal density is replaced by N of the same standard
-# deviation r < 1 at offsets :math:`m_c` with weights :math:`w_c`, symmetric about 0, such that its
-# moments up to the third stay what they are:
-#
-# .. math:: \sum_c w_c = 1, \qquad \sum_c w_c m_c = 0, \qquad r^2 + \sum_c w_c m_c^2 = 1
-#
-# What freedom is left for a given r (the weights and the ratios of the offsets) makes the squared
-# difference of the two densities smallest; a test finds the constants below again.
-#
-# **Opacities.** Along the direction of the split a Gaussian's alpha is :math:`o\, e^{-u^2 / 2}`
-# at a distance of u standard deviations on the image. Seen at an angle its parts lie closer: with
-# :math:`\rho` the part of the split direction's length that the image shows (1 across the view, 0
-# along it) they are at :math:`\rho m_c` with deviation
-# :math:`r_\rho = \sqrt{1 - \rho^2 (1 - r^2)}`. They are blended one behind the other, so their
-# opacities :math:`o_c` (symmetric like the weights) are those that make
-#
-# .. math:: \int \Bigl( 1 - \prod_c \bigl(1 - o_c\, e^{-(u - \rho m_c)^2 / 2 r_\rho^2}\bigr)
-#           - o\, e^{-u^2 / 2} \Bigr)^2 du
-#
-# smallest. For a faint Gaussian seen across that is about :math:`o\, w_c / r_\rho`, the plain
-# statement that a part of the mass has a part of the weight; parts of an opaque one cover each
-# other and need more, and those of one seen end-on lie over each other and need less. The
-# opacities depend on o and :math:`\rho` only and are found by Gauss-Newton steps on a grid of u,
-# with a slight pull towards that statement where it is all the same.
-#
-# References:
-#     Huber et al., On entropy approximation for Gaussian mixture random vectors (2008), section 5:
-#     splitting one component along an axis with constants found beforehand.
-
-
 _GRID_END = 4.0
 """Standard deviations at which the integral ends."""
 
@@ -206,7 +174,37 @@ _ROWS = 16384
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Mixture:
-    """A standard normal distribution in narrower parts."""
+    r"""A standard normal distribution in narrower parts.
+
+    **Offsets, widths and weights.** The standard normal density is replaced by N of the same
+    standard deviation r < 1 at offsets :math:`m_c` with weights :math:`w_c`, symmetric about 0,
+    such that its moments up to the third stay what they are:
+
+    .. math:: \sum_c w_c = 1, \qquad \sum_c w_c m_c = 0, \qquad r^2 + \sum_c w_c m_c^2 = 1
+
+    What freedom is left for a given r (the weights and the ratios of the offsets) makes the squared
+    difference of the two densities smallest; a test finds the constants below again.
+
+    **Opacities.** Along the direction of the split a Gaussian's alpha is :math:`o\, e^{-u^2 / 2}`
+    at a distance of u standard deviations on the image. Seen at an angle its parts lie closer: with
+    :math:`\rho` the part of the split direction's length that the image shows (1 across the view, 0
+    along it) they are at :math:`\rho m_c` with deviation
+    :math:`r_\rho = \sqrt{1 - \rho^2 (1 - r^2)}`. They are blended one behind the other, so their
+    opacities :math:`o_c` (symmetric like the weights) are those that make
+
+    .. math:: \int \Bigl( 1 - \prod_c \bigl(1 - o_c\, e^{-(u - \rho m_c)^2 / 2 r_\rho^2}\bigr)
+              - o\, e^{-u^2 / 2} \Bigr)^2 du
+
+    smallest. For a faint Gaussian seen across that is about :math:`o\, w_c / r_\rho`, the plain
+    statement that a part of the mass has a part of the weight; parts of an opaque one cover each
+    other and need more, and those of one seen end-on lie over each other and need less. The
+    opacities depend on o and :math:`\rho` only and are found by Gauss-Newton steps on a grid of u,
+    with a slight pull towards that statement where it is all the same.
+
+    References:
+        Huber et al., On entropy approximation for Gaussian mixture random vectors (2008), section
+        5: splitting one component along an axis with constants found beforehand.
+    """
 
     offsets: tuple[float, ...]
     """Means of the parts, standard deviations of the whole, ascending."""
@@ -303,24 +301,6 @@ def _mirror_pairs(parts: int) -> Tensor:
     return mirrored
 
 
-# Splitting Gaussians: one becomes several narrower ones that together look like it.
-#
-# With :math:`x = \mu + L z`, :math:`L = R\,\mathrm{diag}(s)`, and a unit direction e in z, the
-# parts of a mixture (`mixture`, offsets m, weights w, width r) are
-#
-# .. math:: \mu_c = \mu + m_c L e, \qquad
-#           \Sigma_c = L \bigl( I - (1 - r^2)\, e e^\top \bigr) L^\top
-#
-# so that with the weights w the mass, the mean and the covariance stay exactly what they were:
-#
-# .. math:: \sum_c w_c = 1, \quad \sum_c w_c \mu_c = \mu, \quad
-#           \sum_c w_c \bigl(\Sigma_c + (\mu_c - \mu)(\mu_c - \mu)^\top\bigr) = \Sigma
-#
-# Along the longest axis only that axis' scale changes. Across a plane with normal n, e is
-# :math:`L^\top n` at unit length: the split that moves the parts farthest from the plane, measured
-# in their own width.
-
-
 _AXIS_TOLERANCE = 1e-9
 """Deviation from an axis, below which a direction is that axis."""
 
@@ -334,7 +314,22 @@ def split(
     parts: int = 3,
     cameras: Sequence[Camera] = (),
 ) -> Edited:
-    """Replace each selected Gaussian by parts that keep its moments and look like it.
+    r"""Replace each selected Gaussian by parts that keep its moments and look like it.
+
+    With :math:`x = \mu + L z`, :math:`L = R\,\mathrm{diag}(s)`, and a unit direction e in z, the
+    parts of a mixture (`mixture`, offsets m, weights w, width r) are
+
+    .. math:: \mu_c = \mu + m_c L e, \qquad
+              \Sigma_c = L \bigl( I - (1 - r^2)\, e e^\top \bigr) L^\top
+
+    so that with the weights w the mass, the mean and the covariance stay exactly what they were:
+
+    .. math:: \sum_c w_c = 1, \quad \sum_c w_c \mu_c = \mu, \quad
+              \sum_c w_c \bigl(\Sigma_c + (\mu_c - \mu)(\mu_c - \mu)^\top\bigr) = \Sigma
+
+    Along the longest axis only that axis' scale changes. Across a plane with normal n, e is
+    :math:`L^\top n` at unit length: the split that moves the parts farthest from the plane,
+    measured in their own width.
 
     Colours and extra columns are copied; opacities are those of `opacities_of_parts`, for the
     angles at which `cameras` see the split.

@@ -413,7 +413,8 @@ class RowStore:
             )
         except OSError as error:
             raise SplatsegError(
-                f"{tempfile.gettempdir()}: rows beyond the memory budget cannot be written ({error})."
+                f"{tempfile.gettempdir()}: rows beyond the memory budget cannot be written "
+                f"({error})."
             ) from error
 
 

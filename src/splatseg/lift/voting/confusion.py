@@ -24,8 +24,8 @@ harms where that is wrong: where one piece of a surface is called something else
 views (the wall between two windows), and where two ids are taken for each other about as often as
 not. Errors that hold over ranges of views are measured by `ViewVotes`, and above
 `ConfusionOptions.max_correlation` votes amount to three views: then the prior weighs against
-changes that the votes do not support strongly. Local errors that come and go from view to view, and swaps,
-cannot be found from votes.
+changes that the votes do not support strongly. Local errors that come and go from view to view, and
+swaps, cannot be found from votes.
 
 References:
     Dawid and Skene, Maximum Likelihood Estimation of Observer Error-Rates Using the EM
@@ -73,14 +73,15 @@ class ViewVotes:
     A vote over many views removes errors that are independent from view to view, and a model of
     such errors can infer what is usually missed (`confusion`). A network that calls a desk a
     nightstand from one side does so in all neighbouring views, and there both fail. So each view is
-    held out in turn: is its vote on a Gaussian predicted better by its nearest view than by any other?
+    held out in turn: is its vote on a Gaussian predicted better by its nearest view than by any
+    other?
 
     .. math:: \rho = \frac{\sum_i (a_i - e_i)}{\sum_i (1 - e_i)}
 
     where, among the views that give Gaussian i one of its two strongest ids, :math:`a_i` is the
     share of those that agree with the nearest other view, as seen from the Gaussian, and
-    :math:`e_i` that of all pairs that agree. Independent errors have 0, errors that neighbours always
-    share have 1 (Cohen's kappa of neighbouring views).
+    :math:`e_i` that of all pairs that agree. Independent errors have 0, errors that neighbours
+    always share have 1 (Cohen's kappa of neighbouring views).
 
     Memory is 8 bytes for each of the sample and each view that votes for it: 40 MB for a thousand
     views that see a seventh of the scene each.
@@ -204,7 +205,7 @@ _MIN_CONFUSION = 3e-3
 """Epsilon: lower bound of the confusion of any two ids."""
 
 _DIAGONAL_PRIOR = 5.0
-"""d: evidence added to the diagonal of the confusion matrix for every id, in fully visible pixels."""
+"""d: evidence added to the diagonal of the confusion matrix, in fully visible pixels."""
 
 _MAX_EVIDENCE = 20.0
 """Upper bound of the evidence of one Gaussian in the confusion matrix, in fully visible pixels."""

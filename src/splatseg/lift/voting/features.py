@@ -12,7 +12,6 @@ References:
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
-from typing import Literal
 
 import torch
 from jaxtyping import Float, Int64
@@ -33,14 +32,13 @@ from splatseg.errors import InputError, ShapeError
 from splatseg.lift.voting.uplift import RenderAdjoint, voting_views
 from splatseg.render import RenderOptions, options_for
 
-FeatureNorm = Literal["none", "unit", "standard"]
-
 _CHANNELS = 64
 """Channels carried at a time, which bounds the memory of upsampled images."""
 
 
 @options(
     removed={
+        "norm": "features are summed as they are",
         "resampling": "pixels read the four cell centres around them",
         "min_weight": "weights of the layer say what a feature rests on",
         "channels": "64 are carried at a time",
@@ -48,11 +46,6 @@ _CHANNELS = 64
 )
 class FeatureUpliftOptions:
     """How feature maps become features of Gaussians."""
-
-    norm: FeatureNorm = "none"
-    """What is done to the features of each view before they are summed. unit: every cell's
-    vector gets length 1 (0 stays 0). standard: every channel gets mean 0 and deviation 1 over
-    the view, against drift from view to view; a constant channel becomes 0."""
 
     longest_side: Count | None = None
     """Longest side, in pixels, of the views through which the features are seen; smaller is
@@ -158,7 +151,7 @@ def _add_view(
             camera = camera.resized(
                 max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
             )
-    features = _normalised(grid.features.float().cpu(), options.norm)
+    features = grid.features.float().cpu()
     weights = torch.zeros(len(values))
     with adjoint.prepared(camera) as prepared:
         for start in range(0, grid.channels, _CHANNELS):
@@ -293,17 +286,3 @@ def checked_grid(view: View, grid: FeatureMap) -> FeatureMap:
                 f"{pixels} pixels of view {view.name}, got {cells}."
             )
     return grid
-
-
-def _normalised(features: Tensor, norm: FeatureNorm) -> Tensor:
-    if norm == "unit":
-        return torch.nn.functional.normalize(features, dim=-1)
-    if norm == "standard":
-        cells = features.flatten(0, 1)
-        deviation = cells.std(dim=0, correction=0)
-        # What rounding leaves of a constant channel is no deviation.
-        threshold = 1e-6 * cells.abs().amax(dim=0)
-        constant = deviation <= threshold
-        scale = torch.where(constant, 0.0, 1 / torch.where(constant, 1.0, deviation))
-        return (features - cells.mean(dim=0)) * scale
-    return features

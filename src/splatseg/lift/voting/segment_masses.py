@@ -23,7 +23,7 @@ from torch import Tensor
 from splatseg import _native
 from splatseg.core import UNLABELLED, Camera, Gaussians, LabelMap, MaskSet
 from splatseg.errors import ShapeError
-from splatseg.render import ImageWeights, RenderOptions, SparseWeights, options_for, weights
+from splatseg.render import ImageWeights, SparseWeights, weights
 from splatseg.render.warp import undistorted_camera, warp_into_photograph
 
 _LAYERS = 12
@@ -239,16 +239,11 @@ class ViewMasses:
 
 
 def view_masses(
-    gaussians: Gaussians,
-    camera: Camera,
-    segments: LabelMap | MaskSet,
-    *,
-    options: RenderOptions | None = None,
-    backend: str = "auto",
+    gaussians: Gaussians, camera: Camera, segments: LabelMap | MaskSet, *, backend: str = "auto"
 ) -> ViewMasses:
     r"""Collect every segment of a view on the Gaussians, sparsely and in one pass.
 
-    With the pieces of the image that no segment divides (`lift.mass.pieces`) as rows of a sparse
+    With the pieces of the image that no segment divides (`pieces_of`) as rows of a sparse
     matrix P over its pixels, and the segments as rows of a sparse 0/1 matrix M over the pieces, all
     masses are
 
@@ -266,7 +261,6 @@ def view_masses(
         gaussians: The Gaussians of the scene.
         camera: The camera of the segments' pixels (see `camera_of_map` for reduced maps).
         segments: A label map, of which -1 is left out, or masks, which may overlap and be empty.
-        options: Switches of the blending model; None is what the Gaussians are meant for.
         backend: Name of the rendering backend.
 
     Returns:
@@ -283,13 +277,8 @@ def view_masses(
     runs = pieces_of(segments)
     # The pieces of a single run say themselves what is covered; of several, those of all together.
     cover = runs[0] if len(runs) == 1 else covered_pieces(runs)
-    options = options or options_for(gaussians, backend)
     found, visible = _sums(
-        runs if len(runs) == 1 else (*runs, cover),
-        gaussians,
-        camera,
-        options=options,
-        backend=backend,
+        runs if len(runs) == 1 else (*runs, cover), gaussians, camera, backend=backend
     )
     if visible is None:
         total = np.zeros(len(gaussians))
@@ -328,24 +317,19 @@ def _covered(pieces: Pieces, sums: Sequence[Any], count: int) -> Float[Tensor, "
 
 
 def _sums(
-    runs: Sequence[Pieces],
-    gaussians: Gaussians,
-    camera: Camera,
-    *,
-    options: RenderOptions,
-    backend: str,
+    runs: Sequence[Pieces], gaussians: Gaussians, camera: Camera, *, backend: str
 ) -> tuple[list[list[Any]], Tensor | None]:
     """Of each run sparse (pieces, Gaussians) of each band; the visibility where pieces lack it."""
     weight = runs[0].weight
     pinhole = undistorted_camera(camera)
     bands = list(_bands(pinhole.height * pinhole.width))
     if len(bands) == 1 and camera.is_pinhole and weight is None:
-        return _image_sums(runs, gaussians, camera, options=options, backend=backend), None
+        return _image_sums(runs, gaussians, camera, backend=backend), None
     pinhole_pixel = None if camera.is_pinhole else _pinhole_pixels(camera)
     found: list[list[Any]] = [[] for _ in runs]
     visible = torch.zeros(len(gaussians))
     for band in bands:
-        rows = _rows(gaussians, pinhole, band, options=options, backend=backend)
+        rows = _rows(gaussians, pinhole, band, backend=backend)
         for pieces, sums in zip(runs, found, strict=True):
             sums.append(_piece_sums(_band_pieces(pieces, band, pinhole_pixel), rows))
         if weight is not None:
@@ -354,17 +338,12 @@ def _sums(
 
 
 def _image_sums(
-    runs: Sequence[Pieces],
-    gaussians: Gaussians,
-    camera: Camera,
-    *,
-    options: RenderOptions,
-    backend: str,
+    runs: Sequence[Pieces], gaussians: Gaussians, camera: Camera, *, backend: str
 ) -> list[list[Any]]:
     """The sums of a whole image, one band: the faster way, without rows of pixels."""
     import scipy.sparse
 
-    image = weights(gaussians, camera, layout="blocks", options=options, backend=backend)
+    image = weights(gaussians, camera, layout="blocks", backend=backend)
     if not isinstance(image, ImageWeights):
         raise TypeError(f"weights: expected those of an image, got {type(image).__name__}.")
     found: list[list[Any]] = []
@@ -428,12 +407,10 @@ def _bands(pixels: int) -> Iterator[slice]:
         yield slice(start, min(start + _BAND, pixels))
 
 
-def _rows(
-    gaussians: Gaussians, camera: Camera, band: slice, *, options: RenderOptions, backend: str
-) -> SparseWeights:
+def _rows(gaussians: Gaussians, camera: Camera, band: slice, *, backend: str) -> SparseWeights:
     """Rows of W for a run of pixels; the whole image goes by the backend's faster way."""
     pixels = None
     if (band.start, band.stop) != (0, camera.height * camera.width):
         flat = torch.arange(band.start, band.stop)
         pixels = torch.stack((flat % camera.width, flat // camera.width), dim=1)
-    return weights(gaussians, camera, pixels, options=options, backend=backend)
+    return weights(gaussians, camera, pixels, backend=backend)

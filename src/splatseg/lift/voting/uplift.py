@@ -7,7 +7,7 @@ A pixel votes for its id on every Gaussian that it shows, with the weight it sho
 
 which is :math:`W^\top` of the one-hot label map, normalised by how much of the Gaussian the
 voting pixels saw. The strongest id is the Gaussian's label and its share the confidence; other
-rules are in `lift.mass.decision`. The transmittance behind all Gaussians votes alike for the label
+rules are in `lift.voting.votes`. The transmittance behind all Gaussians votes alike for the label
 of what none covers, such as the sky:
 
 .. math:: b_c = \sum_{views} \sum_p \Bigl(1 - \sum_i w_{pi}\Bigr) [\mathrm{id}(p) = c]

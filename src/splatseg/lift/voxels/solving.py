@@ -11,7 +11,7 @@ neighbours that look alike:
 
 over the cells p of all views, with :math:`s_{pv}` the share of voxel v in the pixels of cell p,
 blurred by a Gaussian of :math:`\sigma` cells, w the strengths of the neighbour graph of places and
-colours (`lift.completion.graph`), and :math:`\bar f` the mean of all cells. Without neighbours it
+colours (`lift.neighbour_graph`), and :math:`\bar f` the mean of all cells. Without neighbours it
 is the mixing model by which objects are told apart (`lift.words.object_features`); there are far
 more voxels than objects, and what single cells do not settle, neighbours do. Solved by conjugate
 gradients, some channels at a time; the matrix is never formed.

@@ -216,22 +216,22 @@ def _associated_tree(
     table = segment_table(
         gaussians, views, source, longest_side=side, backend=backend, progress=progress
     )
-    needed = {
-        "min_support": options.min_support,
-        "min_views": min(options.min_views, len(table.views)),
-    }
+    support, count = options.min_support, min(options.min_views, len(table.views))
     agreement = table.agreement()
     nested = nesting(agreement, table.level)
     group = cluster(nested.agreement, options.agreement, conflicts=nested.conflicts)
     found, level = separated_levels(
-        segment_tree(table, agreement, nested, group, **needed), nested, **needed
+        segment_tree(table, agreement, nested, group, min_support=support, min_views=count),
+        nested,
+        min_support=support,
+        min_views=count,
     )
     votes = tree_votes(table, found, level, confusion=confusion)
     if sharpen_votes:
         votes = sharpened_votes(
             gaussians, views, source, table, votes, longest_side=side, backend=backend
         )
-    votes = without_outside(votes, table, found, min_support=options.min_support)
+    votes = without_outside(votes, table, found, min_support=support)
     tree, node = instance_tree(table, found, level, votes, classes)
     summary = _summary(table, found.node, tracked=False)
     summary |= {"instances": len(votes.object_rows), "nodes": len(tree.nodes)}

@@ -351,12 +351,6 @@ class Nesting:
         views = self.agreement.seen.shape[1]
         return both.maximum(self.forbidden * float(views)).tocsr()
 
-    @property
-    def share(self) -> float:
-        """Share of the segments that lie inside another or have another inside, in [0, 1]."""
-        both = (self.inside + self.inside.T).tocsr()
-        return float(np.mean(np.diff(both.indptr) > 0)) if both.shape[0] else 0.0
-
 
 def nesting(agreement: Agreement, level: NDArray[np.int64] | None = None) -> Nesting:
     r"""Find what lies inside what within each view.

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from splatseg._check import check_choice, check_range
+from splatseg.core.boundary import convert_fields
 from splatseg.errors import RangeError
 from splatseg.lift.label_maps import Blend
 from splatseg.lift.training import SamplingOptions, TrainingOptions
@@ -131,7 +132,7 @@ class CossegOptions(LabelTrainingOptions):
     """How they learn together."""
 
     def __post_init__(self) -> None:
-        LabelTrainingOptions.__post_init__(self)
+        convert_fields(self)
         if self.link is not None:
             check_choice("link", self.link, get_args(Link))
         check_choice("semantic", self.semantic, get_args(Semantic))

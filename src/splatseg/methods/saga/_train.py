@@ -141,13 +141,7 @@ def _started(
     """What features start as, and the masks with the scales that they are to have."""
     found = None
     if options.associated:
-        found = associate_masks(
-            gaussians,
-            views,
-            MaskSegments(evidence),
-            render_options=context.render_options,
-            backend=context.backend,
-        )
+        found = associate_masks(gaussians, views, MaskSegments(evidence), backend=context.backend)
     if found is not None and options.by_level:
         masks = masks.by_level(found)
     if found is not None and options.start == "association":
