@@ -15,7 +15,7 @@ from PIL import Image
 
 from splatseg.core import Gaussians, LabelMap, Scene, Selection, View
 from splatseg.io.evidence import open_evidence
-from splatseg.lift.field_layers import selection_labels
+from splatseg.lift.field import selection_labels
 from splatseg.lift.label_maps import label_map
 
 MIN_PIXELS = 400

@@ -10,7 +10,7 @@ Every row is a process of its own, so that its seconds and its peak of memory ar
   Gaussians.
 - `object-classes`: classes of the objects of `masks_sam`, in closed form; no part of
   CoSSegGaussians.
-- `logits`, `probabilities`, `identity`, `cosseg`: by default, `cosseg` with features;
+- `identity`, `cosseg`: by default, `cosseg` with features;
   `published`: `cosseg --published`. `--set OPTION=VALUE` changes options of the method.
 - `associate`: of tracks.
 - `joint`: `cosseg` with Gaussians that learn along (`--joint`); with the mean PSNR of test views,
@@ -49,7 +49,7 @@ from splatseg.lift import (
     label_map,
     uplift,
 )
-from splatseg.lift.heads import ClassifierHead
+from splatseg.lift.label_maps import ClassifierHead
 from splatseg.methods import find_method
 from splatseg.tasks.segment import SegmentOptions, segment
 
@@ -60,8 +60,6 @@ METHODS = {
     "majority": ("uplift", {"correct_confusion": False}, {"complete": False}),
     "uplift": ("uplift", {}, {}),
     "associate": ("associate", {}, {}),
-    "logits": ("logits", {}, {}),
-    "probabilities": ("probabilities", {}, {}),
     "identity": ("identity", {}, {}),
     "object-classes": (
         "object-classes", {"features": "features_dino", "masks": "masks_sam"}, {},
@@ -124,8 +122,9 @@ def random_walk(scene: Any, evidence: str) -> Layer:
     features = segment(scene, "features", options=SegmentOptions(evidence="features_dino")).layer
     if not isinstance(features, Features):
         raise TypeError
-    options = CompletionOptions(smoothing=200, smoothing_steps=20, completed_layer="hard")
-    return complete(scene.gaussians, votes, features=features, options=options)
+    options = CompletionOptions(smoothing=200, smoothing_steps=20)
+    walked = complete(scene.gaussians, votes, features=features, options=options)
+    return replace(walked, candidates=None, shares=None)
 
 
 def drawn(bench: ScoredScene, layer: Layer, row: str) -> Path:

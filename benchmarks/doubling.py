@@ -27,15 +27,14 @@ import numpy as np
 import torch
 from memory import room
 from scipy.spatial import cKDTree
+from splatseg.lift.pipeline import lift_labels
 
 from lift import HEIGHT, WIDTH, camera
 from splatseg.core import Gaussians, LabelMap, Labels, MaskSet, Rle, Scene, View
 from splatseg.edit import load_document
 from splatseg.io.layers import save_layer
 from splatseg.io.scene import save_scene
-from splatseg.lift import label_map, uplift
-from splatseg.lift.completion.complete import complete
-from splatseg.lift.pipeline import lift_labels
+from splatseg.lift import complete, label_map, uplift
 from splatseg.methods.associate import associate
 from splatseg.render import render
 from splatseg.tasks.edit import edit_scene

@@ -117,11 +117,11 @@ def semantic(bench: Bench) -> None:
     hard = replace(soft, candidates=None, shares=None)
     bench.row("labels_semantic, uplift", "semantic", lambda: hard)
     bench.row("labels_semantic, completed", "semantic", lambda: complete(gaussians, hard))
-    smooth = CompletionOptions(smoothing=50, completed_layer="hard")
+    smooth = CompletionOptions(smoothing=50)
     bench.row(
         "labels_semantic, smoothed",
         "semantic",
-        lambda: complete(gaussians, soft, options=smooth),
+        lambda: hardened(complete(gaussians, soft, options=smooth)),
     )
     again = correct_confusion(soft, view_correlation=soft.info.view_correlation)
     hard = replace(again, candidates=None, shares=None)
@@ -129,7 +129,7 @@ def semantic(bench: Bench) -> None:
     bench.row(
         "labels_semantic, relabelled and smoothed",
         "semantic",
-        lambda: complete(gaussians, again, options=smooth),
+        lambda: hardened(complete(gaussians, again, options=smooth)),
     )
 
 
@@ -161,6 +161,11 @@ def panoptic(bench: Bench) -> None:
 def sam(bench: Bench) -> None:
     """Overlapping masks of objects, parts and groups."""
     _associated(bench, "masks_sam", bench.evidence("masks_sam"))
+
+
+def hardened(labels: Labels) -> Labels:
+    """The winners alone."""
+    return replace(labels, candidates=None, shares=None)
 
 
 def _completed(gaussians: Gaussians, layer: Labels | InstanceTree) -> Labels:

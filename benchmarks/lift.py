@@ -34,9 +34,9 @@ from splatseg.core import Camera, FeatureMap, LabelMap, MaskSet, Rle, View
 from splatseg.io.evidence import open_evidence
 from splatseg.io.scene import load_scene
 from splatseg.lift import UpliftOptions, uplift
-from splatseg.lift.mass.features import uplift_features
-from splatseg.lift.mass.segment_masses import view_masses
-from splatseg.lift.segments.recorded import EvidenceSegments
+from splatseg.lift.segments import EvidenceSegments
+from splatseg.lift.voting.features import uplift_features
+from splatseg.lift.voting.segment_masses import view_masses
 from splatseg.methods.associate import associate
 from splatseg.render.cpu import threads
 

@@ -28,8 +28,8 @@ from scored import ScoredScene, run_rows
 
 from splatseg.core import InstanceTree, Labels, MaskSet
 from splatseg.io.evidence import open_evidence
-from splatseg.lift.completion.complete import complete
-from splatseg.lift.segments.recorded import EvidenceSegments
+from splatseg.lift.completion import complete
+from splatseg.lift.segments import EvidenceSegments
 from splatseg.methods.associate import AssociateOptions, associate
 
 _CUTS = ("group", "object", "part", 0.75)
@@ -127,7 +127,7 @@ def one_level(level: str, truth: str) -> Callable[[Bench], None]:
 
     def row(bench: Bench) -> None:
         source = OneLevel(bench.data, "masks_nested", (level,))
-        layer, seconds = bench.made(source, overlapping="flat")
+        layer, seconds = bench.made(source, level="object")
         if isinstance(layer, InstanceTree):
             raise TypeError("expected labels")
         folder = bench.draw(layer, f"{level}s")
@@ -141,7 +141,7 @@ def flat(bench: Bench) -> None:
     """Without levels, at the default agreement and a higher one."""
     source = EvidenceSegments(evidence=open_evidence(bench.data / "masks_nested"))
     for agreement in (0.2, 0.6):
-        layer, seconds = bench.made(source, overlapping="flat", agreement=agreement)
+        layer, seconds = bench.made(source, level="object", agreement=agreement)
         if isinstance(layer, InstanceTree):
             raise TypeError("expected labels")
         folder = bench.draw(layer, "flat")
@@ -156,7 +156,7 @@ def sam(bench: Bench) -> None:
     layer, seconds = bench.made(source)
     if isinstance(layer, InstanceTree):
         report_tree(bench, "masks_sam", layer, seconds)
-    layer, seconds = bench.made(source, overlapping="flat")
+    layer, seconds = bench.made(source, level="object")
     if isinstance(layer, Labels):
         folder = bench.draw(layer, "masks_sam_flat")
         line("masks_sam, flat", bench.score("instances", [folder], "instance"), seconds)

@@ -32,14 +32,16 @@ from scipy.sparse.csgraph import connected_components
 from splatseg.core import Gaussians, MaskSet
 from splatseg.io.evidence import open_evidence
 from splatseg.io.scene import load_scene
-from splatseg.lift.segments.clustering import cluster
-from splatseg.lift.segments.levels import node_levels
-from splatseg.lift.segments.nesting import Nesting, nesting
-from splatseg.lift.segments.recorded import EvidenceSegments
-from splatseg.lift.segments.separate import separated_levels
-from splatseg.lift.segments.table import SegmentTable, segment_table
-from splatseg.lift.segments.tree import SegmentTree, segment_tree
+from splatseg.lift.segments import EvidenceSegments
 from splatseg.methods.associate import AssociateOptions
+from splatseg.methods.associate._clustering import Nesting, cluster, nesting
+from splatseg.methods.associate._table import SegmentTable, segment_table
+from splatseg.methods.associate._tree import (
+    SegmentTree,
+    node_levels,
+    segment_tree,
+    separated_levels,
+)
 from splatseg.neighbours import NeighbourIndex
 
 _LEVELS = ("part", "object", "group")
@@ -200,7 +202,7 @@ def _held(tree: SegmentTree, table: SegmentTable, nested: Nesting, row: int) -> 
 def _cores(tree: SegmentTree, table: SegmentTable) -> list[NDArray[np.int64]]:
     """The Gaussians of which a node holds at least half of what its views see."""
     masses = table.masses(tree.node, np.ones(len(tree.node)))
-    squares = table.sights().power(2)
+    squares = table.visibility().power(2)
     had = np.zeros((len(table.views), len(tree.parent)))
     member = tree.node >= 0
     had[table.view[member], tree.node[member]] = 1
@@ -254,7 +256,6 @@ def main() -> None:
         scene.gaussians,
         scene.train_views,
         EvidenceSegments(evidence=open_evidence(arguments.data / arguments.evidence)),
-        max_views=options.max_views,
         longest_side=options.longest_side,
     )
     agreement = table.agreement()
@@ -266,7 +267,6 @@ def main() -> None:
         cluster(nested.agreement, options.agreement, conflicts=nested.conflicts),
         min_support=options.min_support,
         min_views=options.min_views,
-        overlap=options.overlap,
     )
     truth = node_truth(arguments.data, arguments.evidence, table, tree)
     score = np.array([table.score[tree.node == node].mean() for node in range(len(tree.parent))])

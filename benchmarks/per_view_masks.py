@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from splatseg.core import LabelMap, Scene, Selection, View
 from splatseg.io.evidence import open_evidence
-from splatseg.lift.mass.segment_masses import view_masses
-from splatseg.lift.view_renderer import ViewRenderer
+from splatseg.lift.label_maps import ViewRenderer
+from splatseg.lift.voting.segment_masses import view_masses
 from splatseg.render import prepare
 
 _FITS = 0.5

@@ -1,16 +1,15 @@
 """What removing a thing leaves of it, and what it does to the rest of the image.
 
     splatseg fit ../shared/data/toys -o SCENE
-    python benchmarks/removal.py SCENE ../shared/data/toys [--split once|each|off]
+    python benchmarks/removal.py SCENE ../shared/data/toys [--split each|off]
 
 A layer `things` that SCENE holds is taken as it is, made for instance by ``splatseg segment SCENE
 --method uplift --evidence instance --layer things``.
 
 Things are selected by lifting the truth masks of the training views (`uplift`) and removed, one
 after the other, each from the whole scene. Gaussians that straddle a boundary are split before:
-`once` at all boundaries together (`cut_labels`), which is three passes over the views for all
-things; `each` at the thing's own masks as `splatseg edit --remove` does it, three passes a thing;
-`off` nowhere.
+`each` at the thing's own masks as `splatseg edit --remove` does it, three passes a thing; `off`
+nowhere.
 
 - left: the blending weight W'm of the thing's training masks m that falls on Gaussians which are
   not removed, as a share of all of it. Pixels at the border of a mask show both sides, in the
@@ -38,7 +37,7 @@ from splatseg.core import Gaussians, LabelMap, Labels, Scene, Selection, View
 from splatseg.edit import CutBy, Document, Operation, load_document, prepare, remove
 from splatseg.evaluate import psnr, render_and_photograph
 from splatseg.io.evidence import Evidence, open_evidence
-from splatseg.lift import CutOptions, GaussianField, UpliftOptions, cut_labels, uplift
+from splatseg.lift import CutOptions, GaussianField, UpliftOptions, uplift
 from splatseg.render import back_project
 from splatseg.selection import Where
 
@@ -175,23 +174,11 @@ def lifted(scene: Scene, truth: Evidence) -> Labels:
     return replace(labels, info=replace(labels.info, evidence=FOLDER))
 
 
-def together(
-    document: Document, things: dict[int, str], truth: Evidence, cut: CutOptions | None, thin: int
-):
-    """All things of one scene, split at all boundaries or not at all."""
+def together(document: Document, things: dict[int, str], truth: Evidence, thin: int):
+    """All things of one scene as it is."""
     scene, labels = document.scene, document.layers[LAYER]
     pictures = Pictures(scene, truth, thin)
     gaussians = scene.gaussians
-    if cut is not None:
-        edited, labels = cut_labels(gaussians, labels, scene.train_views, truth, options=cut)
-        gaussians = edited.gaussians
-        split = len(set(edited.rows[edited.fractions < 1].tolist()))
-        print(
-            f"{split} Gaussians of {len(edited.rows) - len(gaussians) + len(scene.gaussians)} "
-            f"split at all boundaries, {len(gaussians)} now; pictures before and after are "
-            f"{pictures.apart(gaussians):.1f} dB apart",
-            flush=True,
-        )
     gone = {thing: labels.ids == thing for thing in things}
     masses = Masses(tuple(things))
     for view in scene.train_views[::thin]:
@@ -276,7 +263,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("scene", type=Path)
     parser.add_argument("data", type=Path)
-    parser.add_argument("--split", choices=("once", "each", "off"), default="once")
+    parser.add_argument("--split", choices=("each", "off"), default="each")
     parser.add_argument("--every", type=int, default=1, help="only every n-th thing")
     parser.add_argument("--ids", type=int, nargs="+", help="only these things")
     parser.add_argument(
@@ -289,7 +276,7 @@ def main() -> None:
     document = load_document(args.scene, data=args.data)
     truth = open_evidence(args.data / FOLDER)
     labels = document.layers.get(LAYER)
-    if not isinstance(labels, Labels) or (args.split == "once" and labels.candidates is None):
+    if not isinstance(labels, Labels):
         labels = lifted(document.scene, truth)
     document = Document(scene=document.scene, layers={LAYER: labels})
     things = dict(list(things_of(args.data, set(labels.present.tolist())).items())[:: args.every])
@@ -299,9 +286,7 @@ def main() -> None:
     if args.split == "each":
         removed = one_by_one(document, things, truth, cut, args.thin)
     else:
-        removed = together(
-            document, things, truth, cut if args.split == "once" else None, args.thin
-        )
+        removed = together(document, things, truth, args.thin)
     found: list[Removed] = []
     for one in removed:
         if not one.pixels:

@@ -41,7 +41,7 @@ from splatseg.errors import InputError
 from splatseg.io.evidence import save_masks
 from splatseg.io.scene import load_scene
 from splatseg.lift import GaussianField, complete, uplift
-from splatseg.lift.mass.segment_masses import view_masses
+from splatseg.lift.voting.segment_masses import view_masses
 from splatseg.prompting.prompts import ViewPrompt
 from splatseg.tasks import SelectOptions, open_selector
 

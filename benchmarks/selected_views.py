@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from splatseg.core import Scene, Selection
-from splatseg.lift.view_renderer import ViewRenderer
+from splatseg.lift.label_maps import ViewRenderer
 from splatseg.render import prepare
 
 _CHANNELS = 32

@@ -43,7 +43,7 @@ def layer(bench: Bench, found: Evidence) -> Labels:
         made = associate(gaussians, bench.train, EvidenceSegments(evidence=found))
         labels = made.cut() if isinstance(made, InstanceTree) else made
     else:
-        votes = uplift(gaussians, bench.train, found, options=UpliftOptions(candidates=8, slots=8))
+        votes = uplift(gaussians, bench.train, found, options=UpliftOptions(candidates=8))
         labels = replace(correct_confusion(votes), candidates=None, shares=None)
     return complete(gaussians, labels)
 
@@ -99,11 +99,8 @@ def main() -> None:
     standard = SharpenOptions()
     parser.add_argument("--label-weight", type=float, default=standard.label_weight)
     parser.add_argument("--steps", type=int, default=standard.sharpen_steps)
-    parser.add_argument("--rates-from", type=float, default=standard.rates_from)
     args = parser.parse_args()
-    options = SharpenOptions(
-        label_weight=args.label_weight, sharpen_steps=args.steps, rates_from=args.rates_from
-    )
+    options = SharpenOptions(label_weight=args.label_weight, sharpen_steps=args.steps)
     with tempfile.TemporaryDirectory() as work:
         bench = Bench(load_scene(args.scene, data=args.data), args.data, Path(work))
         for name in args.evidence:

@@ -33,6 +33,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image
+from splatseg.tasks.segment_options import SegmentOptions
 from street_field import peak
 from torch.utils.flop_counter import FlopCounterMode
 
@@ -40,7 +41,7 @@ from splatseg.core import Features, LabelMap, Scene
 from splatseg.io.evidence import open_evidence
 from splatseg.io.scene import load_scene
 from splatseg.lift import label_map
-from splatseg.lift.heads import ClassifierHead
+from splatseg.lift.label_maps import ClassifierHead
 from splatseg.lift.training import (
     AdamConstants,
     LabelTargets,
@@ -51,9 +52,7 @@ from splatseg.lift.training import (
 )
 from splatseg.methods import find_method
 from splatseg.methods.identity import IdentityOptions, TrainingContext, train_identity
-from splatseg.methods.logits import LogitOptions, train_logits
-from splatseg.methods.probabilities import train_probabilities
-from splatseg.tasks.segment import SegmentOptions, segment
+from splatseg.tasks.segment import segment
 
 SCORER = Path(__file__).resolve().parents[1] / ".." / "shared" / "score" / "score.py"
 CHANNELS = 16
@@ -119,11 +118,13 @@ def speed(arguments: argparse.Namespace) -> None:
         used, begin = cpu_seconds(), time.perf_counter()
         drawn = sampler.draw(rng, batch=arguments.batch)
         used, begin = cpu_seconds() - used, time.perf_counter() - begin
-        rows, entries = drawn.pixels, drawn.entries
+        views = drawn._store._views
+        rows = sum(len(view) for view in views)
+        entries = sum(len(view.rows.ids) for view in views)
         print(
             f"min_weight {min_weight}: {rows} rows in {begin:.1f} s ({used:.1f} s CPU), "
             f"{rows / used:.0f} rows a CPU second; {entries / rows:.0f} entries and "
-            f"{drawn.nbytes / rows:.0f} bytes a row"
+            f"{sum(view.nbytes for view in views) / rows:.0f} bytes a row"
         )
         step(drawn, len(scene.gaussians), arguments)
         drawn.close()
@@ -236,8 +237,6 @@ def methods(steps: int | None) -> dict[str, Callable[..., Features]]:
         "published": of(train_identity, IdentityOptions.published()),
         "features": of(train_identity, IdentityOptions(blend="features")),
         "identity": of(train_identity, IdentityOptions()),
-        "logits": of(train_logits, LogitOptions()),
-        "probabilities": of(train_probabilities, LogitOptions()),
     }
 
 

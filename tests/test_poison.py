@@ -16,7 +16,7 @@ import pytest
 
 from splatseg.core.boundary import converters
 from splatseg.errors import SplatsegError
-from splatseg.methods import _registry
+from splatseg.methods import _method
 from support import poison
 from support.public import public_callables
 
@@ -50,7 +50,7 @@ SLOW = (
     "tasks.s",
     "tasks.report_layer",
     "lift.cut_",
-    "lift.attach",
+    "lift.match_gaussians",
     "importing.",
     "models.record_evidence",
     "models.classical.region_masks",
@@ -63,11 +63,11 @@ SLOW = (
 
 @pytest.fixture(scope="module")
 def known(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
-    before = dict(_registry._REGISTERED)
+    before = dict(_method._REGISTERED)
     yield poison.valid(poison.World(tmp_path_factory.mktemp("world")))
     # `register_method` is called too: pages of help that are tested later know no such method.
-    _registry._REGISTERED.clear()
-    _registry._REGISTERED.update(before)
+    _method._REGISTERED.clear()
+    _method._REGISTERED.update(before)
 
 
 def runs_nothing(value: Callable[..., Any]) -> bool:

@@ -216,7 +216,7 @@ def test_an_interrupted_segment_leaves_the_layer_as_it_was(
     before = {p: p.read_bytes() for p in segmented.scene.rglob("*") if p.is_file()}
     # The package's function of the same name hides the module from an import statement.
     monkeypatch.setattr(
-        importlib.import_module("splatseg.lift.mass.adjoint"), "prepare", interrupted
+        importlib.import_module("splatseg.lift.voting.uplift"), "prepare", interrupted
     )
     assert splatseg("segment", segmented.scene, *SEGMENT, "--layer", "semantic")[0] == 1
     after = {p: p.read_bytes() for p in segmented.scene.rglob("*") if p.is_file()}

@@ -16,7 +16,7 @@ from splatseg.io.scene import load_scene, load_scene_layer
 from splatseg.methods import (
     ENTRY_POINT_GROUP,
     Method,
-    _registry,
+    _method,
     find_method,
     keeps_boundaries,
     keeps_ids,
@@ -44,7 +44,7 @@ def installed(monkeypatch):
 
     def install(**values: str) -> None:
         entries = [EntryPoint(name=n, value=v, group=ENTRY_POINT_GROUP) for n, v in values.items()]
-        monkeypatch.setattr(_registry, "entry_points", lambda group: entries)
+        monkeypatch.setattr(_method, "entry_points", lambda group: entries)
 
     return install
 
@@ -66,7 +66,7 @@ def test_the_same_file_is_a_method_of_ours(small, splatseg, monkeypatch) -> None
     module = types.ModuleType("splatseg.methods.majority")
     exec(compile(MAJORITY, "majority.py", "exec"), module.__dict__)
     monkeypatch.setitem(sys.modules, module.__name__, module)
-    monkeypatch.setattr(_registry, "_OWN", (*_registry._OWN, "majority"))
+    monkeypatch.setattr(_method, "_OWN", {**_method._OWN, "majority": "majority:METHOD"})
     status, _, error = splatseg(
         *("segment", small.scene, "--method", "majority", "--min-share", "0.6"),
         *("--evidence", "labels_semantic"),
@@ -209,7 +209,7 @@ def test_options_of_another_method_are_refused_in_python(small) -> None:
 
 def test_ours_come_first_and_cannot_be_replaced(installed) -> None:
     installed(uplift="json:loads", other="splatseg.methods.vote:METHOD")
-    assert method_names() == (*_registry._OWN, *_registry._ABOVE, "other")
+    assert method_names() == (*_method._OWN, *_method._ABOVE, "other")
     assert find_method("uplift").name == "uplift"
 
 
@@ -255,3 +255,12 @@ def test_the_table_of_methods_is_what_they_declare(page) -> None:
 def test_a_page_without_marks_is_refused() -> None:
     with pytest.raises(FileFormatError, match="expected the marks"):
         with_table("no marks", "table")
+
+
+def test_a_method_that_went_says_what_to_use_and_its_layers_keep_their_ids() -> None:
+    for name in ("logits", "probabilities"):
+        assert name not in method_names()
+        with pytest.raises(InputError, match=f"method '{name}' was removed; identity with as many"):
+            find_method(name)
+        assert keeps_ids(name)
+        assert keeps_boundaries(name)

@@ -10,20 +10,21 @@ from PIL import Image
 from splatseg.core import Features
 from splatseg.io.scene import load_scene, load_scene_layer, save_scene_layer
 from splatseg.lift import GaussianField, label_map
-from splatseg.lift.heads import ClassifierHead
+from splatseg.lift.label_maps import ClassifierHead
 
 CPU = ("--backend", "cpu")
 FAST = ("--steps", 40, "--pixels", 200, "--held-out", 0)
-METHODS = ("identity", "logits", "probabilities")
+LAYERS = {"identity": (), "features": ("--blend", "features")}
+"""Layers, and how each is trained."""
 
 
 @pytest.fixture
 def trained(small, splatseg):
-    """A layer of rendered readout of each method."""
-    for method in METHODS:
+    """A layer of rendered readout of each kind."""
+    for layer, options in LAYERS.items():
         status, _, err = splatseg(
-            "segment", small.scene, "--method", method, "--evidence", "labels_semantic",
-            "--layer", method, "--readout", "rendered", *FAST, *CPU,
+            "segment", small.scene, "--method", "identity", "--evidence", "labels_semantic",
+            "--layer", layer, "--readout", "rendered", *options, *FAST, *CPU,
         )  # fmt: skip
         assert status == 0, err
     return small
@@ -34,7 +35,7 @@ def ids_of(path) -> np.ndarray:
 
 
 def test_render_draws_the_layers_own_readout(trained, splatseg, tmp_path) -> None:
-    names = [*METHODS, "identity@hard"]
+    names = [*LAYERS, "identity@hard"]
     status, text, err = splatseg(
         "render", trained.scene, "--what", ",".join(names), "--split", "all", "--coloured",
         "-o", tmp_path / "out", "--json", *CPU,
@@ -43,7 +44,7 @@ def test_render_draws_the_layers_own_readout(trained, splatseg, tmp_path) -> Non
     entries = json.loads(text)["entries"]
     assert entries == [*names, *(f"{name}_coloured" for name in names)]
     scene = load_scene(trained.scene)
-    for name in METHODS:
+    for name in LAYERS:
         layer = load_scene_layer(trained.scene, name)
         assert isinstance(layer, Features)
         head = ClassifierHead.of(layer)
@@ -63,7 +64,7 @@ def test_render_draws_the_layers_own_readout(trained, splatseg, tmp_path) -> Non
     assert np.array_equal(written, expected.clamp_min(0).numpy())
 
 
-@pytest.mark.parametrize("layer", ["identity", "logits", "identity@hard"])
+@pytest.mark.parametrize("layer", ["identity", "features", "identity@hard"])
 def test_scores_agree_with_the_scorer_on_what_was_written(
     trained, splatseg, score, tmp_path, layer
 ) -> None:
@@ -95,12 +96,12 @@ def test_scores_agree_with_the_scorer_on_what_was_written(
 def test_points_take_labels_by_the_readout(trained, splatseg, tmp_path) -> None:
     scene = load_scene(trained.scene)
     xyz = scene.gaussians.means[::3].numpy()
-    layer = load_scene_layer(trained.scene, "probabilities")
+    layer = load_scene_layer(trained.scene, "identity")
     found = GaussianField(scene.gaussians, {"p": layer}).labels_at(scene.gaussians.means[::3], "p")
     truth = np.where(xyz[:, 0] < 0, 2, 7)
     np.savez(tmp_path / "points.npz", xyz=xyz, semantic=truth)
     status, text, err = splatseg(
-        "evaluate", trained.scene, "--layer", "probabilities",
+        "evaluate", trained.scene, "--layer", "identity",
         "--points", tmp_path / "points.npz", "--json",
     )  # fmt: skip
     assert status == 0, err

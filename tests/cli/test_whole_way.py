@@ -63,7 +63,7 @@ def test_the_fit_shows_held_out_views(room, run) -> None:
 
 @pytest.mark.parametrize(
     ("method", "options"),
-    [("uplift", ()), ("vote", ()), ("identity", TRAINED), ("probabilities", TRAINED)],
+    [("uplift", ()), ("vote", ()), ("identity", TRAINED)],
 )
 def test_classes_of_label_maps(room, run, scored, method, options) -> None:
     words = ("--method", method, "--evidence", "labels_semantic", "--layer", "classes")

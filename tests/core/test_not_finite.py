@@ -8,7 +8,7 @@ from splatseg.core.models import Boxes
 from splatseg.core.renderable import PointLabels
 from splatseg.errors import RangeError
 from splatseg.evaluate import psnr, ssim
-from splatseg.lift.relevancy import relevancy
+from splatseg.lift.vocabulary import relevancy
 from splatseg_bench.scene import TruePoints
 
 IDS = torch.tensor([1, 2], dtype=torch.int32)

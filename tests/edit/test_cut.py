@@ -6,16 +6,24 @@ import numpy as np
 import pytest
 import torch
 
-from splatseg.core import Camera, Gaussians, LabelMap, Labels, Selection, View
+from splatseg.core import Camera, Gaussians, LabelMap, Selection, View
 from splatseg.core.rigid import rotation_from_quaternion
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.lift import CutOptions, UpliftOptions, cut_box, cut_labels, cut_masks, uplift
-from splatseg.lift.boundaries.sides import on_border, sides_of
-from splatseg.render import RenderOptions, render
+from splatseg.lift import CutOptions, cut_box, cut_masks
+from splatseg.lift.boundaries import cut as module
+from splatseg.lift.boundaries.cut import on_border, sides_of
+from splatseg.render import render
 
 from .conftest import BACKEND, camera
 
-ALL = CutOptions(min_pixels=0, min_weight=0, border_weight=1)
+ALL = CutOptions(min_pixels=0)
+
+
+@pytest.fixture(autouse=True)
+def every_pixel_counts(monkeypatch) -> None:
+    """However little shows a Gaussian, and at borders as elsewhere."""
+    monkeypatch.setattr(module, "_MIN_WEIGHT", 0)
+    monkeypatch.setattr(module, "_BORDER_WEIGHT", 1)
 
 
 class Halves:
@@ -63,9 +71,7 @@ def test_the_direction_is_across_the_boundary() -> None:
             ball,
             views,
             Halves(views, slope=slope),
-            torch.tensor([1]),
-            torch.tensor([2]),
-            options=RenderOptions(),
+            [1],
             backend=BACKEND,
         )
         assert float(sides.share) == pytest.approx(0.5, abs=0.02)
@@ -96,9 +102,7 @@ def test_the_direction_knows_the_shape_and_the_turn_of_the_gaussian(rng) -> None
         flat,
         views,
         Halves(views),
-        torch.tensor([1]),
-        torch.tensor([2]),
-        options=RenderOptions(),
+        [1],
         backend=BACKEND,
     )
     axes = rotation_from_quaternion(turn)[0] * flat.scales[0]
@@ -120,10 +124,8 @@ def test_a_border_pixel_counts_what_it_is_told_to() -> None:
             ball,
             views,
             Halves(views),
-            torch.tensor([1]),
-            torch.tensor([2]),
+            [1],
             border_weight=weight,
-            options=RenderOptions(),
             backend=BACKEND,
         )
         amounts.append(float(sides.inside))
@@ -131,7 +133,7 @@ def test_a_border_pixel_counts_what_it_is_told_to() -> None:
     assert amounts[2] < amounts[0]
 
 
-def test_masks_cut_what_straddles_and_only_that() -> None:
+def test_masks_cut_what_straddles_and_only_that(monkeypatch) -> None:
     """Three in a row: left, on the boundary, right. Only the middle one is split."""
     row = gaussians_at([[-1.5, 0, 0], [0, 0, 0], [1.5, 0, 0]], [0.4, 0.2, 0.2])
     views = views_of(camera(), camera(turn=0.05))
@@ -144,16 +146,11 @@ def test_masks_cut_what_straddles_and_only_that() -> None:
     assert float(inside.max()) < float(outside.min())
     # The heaviest part of a symmetric split lies on the boundary until the second round.
     assert len(cut.edited) > 2 + 3
-    once = cut_masks(
-        row,
-        views,
-        Halves(views),
-        [1],
-        options=CutOptions(min_pixels=0, min_weight=0, border_weight=1, rounds=1),
-        backend=BACKEND,
-    )
+    monkeypatch.setattr(module, "_ROUNDS", 1)
+    once = cut_masks(row, views, Halves(views), [1], options=ALL, backend=BACKEND)
     assert len(once.edited) == 5
-    none = cut_masks(row, views, Halves(views), [1], options=CutOptions(rounds=0), backend=BACKEND)
+    monkeypatch.setattr(module, "_ROUNDS", 0)
+    none = cut_masks(row, views, Halves(views), [1], backend=BACKEND)
     assert len(none.edited) == 3
     assert none.split == 0
     lost = [left_of(c, views) for c in (none, once, cut)]
@@ -178,61 +175,36 @@ def left_of(cut, views) -> float:
 
 @pytest.mark.parametrize(
     "changes",
-    [{"min_side": 0.5}, {"min_pixels": 20.0}, {"min_weight": 1e4}],
+    [{"min_side": 0.5}, {"min_pixels": 20.0}, {}],
 )
-def test_each_limit_keeps_a_gaussian_whole(changes) -> None:
+def test_each_limit_keeps_a_gaussian_whole(changes, monkeypatch) -> None:
     row = gaussians_at([[0.12, 0, 0]], [0.4, 0.2, 0.2])
     views = views_of(camera())
-    options = CutOptions(**{"min_pixels": 0, "min_weight": 0, "border_weight": 1} | changes)
+    options = CutOptions(**{"min_pixels": 0} | changes)
+    monkeypatch.setattr(module, "_MIN_WEIGHT", 0 if changes else 1e4)
     cut = cut_masks(row, views, Halves(views), [1], options=options, backend=BACKEND)
     assert cut.split == 0
     assert len(cut.edited) == 1
+    monkeypatch.setattr(module, "_MIN_WEIGHT", 0)
     assert cut_masks(row, views, Halves(views), [1], options=ALL, backend=BACKEND).split == 1
 
 
-def test_the_share_to_keep_decides_what_is_inside() -> None:
+def test_the_share_to_keep_decides_what_is_inside(monkeypatch) -> None:
+    monkeypatch.setattr(module, "_ROUNDS", 0)
     row = gaussians_at([[0.12, 0, 0]], [0.4, 0.2, 0.2])
     views = views_of(camera())
     for keep, inside in ((0.5, False), (0.2, True)):
-        options = CutOptions(rounds=0, keep_share=keep, border_weight=1)
+        options = CutOptions(keep_share=keep)
         cut = cut_masks(row, views, Halves(views), [1], options=options, backend=BACKEND)
         assert bool(cut.inside.mask[0]) is inside
         assert 0.2 < float(cut.share) < 0.5
 
 
-def test_all_boundaries_of_a_layer_at_once(rng) -> None:
-    row = gaussians_at([[-1.5, 0, 0], [0.1, 0, 0], [1.5, 0, 0]], [0.4, 0.2, 0.2])
-    views = views_of(camera(), camera(turn=0.05))
-    maps = Halves(views)
-    labels = uplift(row, views, maps, options=UpliftOptions(candidates=2), backend=BACKEND)
-    assert labels.ids.tolist() == [1, 2, 2]
-    steps = []
-    edited, after = cut_labels(
-        row,
-        labels,
-        views,
-        maps,
-        options=ALL,
-        backend=BACKEND,
-        progress=lambda done, total: steps.append((done, total)),
-    )
-    assert steps[-1] == (6, 6)
-    assert len(after) == len(edited.gaussians) > 5
-    assert after.ids[:2].tolist() == [1, 2]
-    means = edited.gaussians.means[:, 0]
-    assert float(means[after.ids == 1].max()) < float(means[after.ids == 2].min())
-    assert torch.equal(after.ids, after.candidates[:, 0])
-    assert torch.equal(after.confidence, after.shares[:, 0])
-    assert bool((after.shares.sum(1) <= 1 + 1e-5).all())
-    # A part's label is what lifting the masks again would give it.
-    again = uplift(edited.gaussians, views, maps, backend=BACKEND)
-    assert torch.equal(again.ids, after.ids)
-
-
-def test_a_box_cuts_at_its_faces() -> None:
+def test_a_box_cuts_at_its_faces(monkeypatch) -> None:
     """Across the face x = 1, beyond it, inside, and beside the box at the face's plane."""
     four = gaussians_at([[1.0, 0, 0], [3, 0, 0], [0, 0, 0], [1.0, 5, 0]], [0.4, 0.1, 0.1])
-    cut = cut_box(four, (-1, -1, -1), (1, 1, 1), options=CutOptions(rounds=1))
+    monkeypatch.setattr(module, "_ROUNDS", 1)
+    cut = cut_box(four, (-1, -1, -1), (1, 1, 1))
     assert cut.split == 1
     assert cut.edited.rows.tolist() == [1, 2, 3, 0, 0, 0]
     x = cut.edited.gaussians.means[3:, 0]
@@ -248,11 +220,12 @@ def cut_all(gaussians: Gaussians):
     return Selection(mask=torch.ones(len(gaussians), dtype=torch.bool))
 
 
-def test_a_box_cuts_along_a_turned_gaussian(rng) -> None:
+def test_a_box_cuts_along_a_turned_gaussian(rng, monkeypatch) -> None:
     """A rod at 45 degrees to the face is cut along itself, not along the face's normal."""
     turn = torch.tensor([[math.cos(math.pi / 8), 0, 0, math.sin(math.pi / 8)]])
     rod = gaussians_at([[1.0, 0, 0]], [0.5, 0.02, 0.02]).replace(rotations=turn)
-    cut = cut_box(rod, (-1, -2, -2), (1, 2, 2), options=CutOptions(rounds=1))
+    monkeypatch.setattr(module, "_ROUNDS", 1)
+    cut = cut_box(rod, (-1, -2, -2), (1, 2, 2))
     offsets = cut.edited.gaussians.means[[0, 2]] - rod.means
     slope = offsets[:, 1] / offsets[:, 0]
     torch.testing.assert_close(slope, torch.ones(2), atol=0.01, rtol=0)
@@ -275,11 +248,6 @@ def test_hostile_cuts_are_refused(some) -> None:
         cut_masks(some, views, Halves(views, void=True), [1], backend=BACKEND)
     with pytest.raises(InputError, match="1 of 1 have none, the first is w"):
         cut_masks(some, (View(name="w", camera=camera()),), maps, [1])
-    hard = Labels(ids=torch.ones(24, dtype=torch.int32), confidence=torch.ones(24))
-    with pytest.raises(InputError, match="expected a layer with two candidates"):
-        cut_labels(some, hard, views, maps)
-    with pytest.raises(ShapeError, match="labels: expected 24 rows, got 3"):
-        cut_labels(some, hard[:3], views, maps)
     with pytest.raises(RangeError, match="box: expected a first corner below the second"):
         cut_box(some, (0, 0, 0), (1, 0, 1))
     with pytest.raises(RangeError, match="box: expected finite numbers"):
@@ -287,10 +255,8 @@ def test_hostile_cuts_are_refused(some) -> None:
     with pytest.raises(ShapeError, match="box: expected two points, got 2 and 3 numbers"):
         cut_box(some, (0, 0), (1, 1, 1))
     for changes, message in (
-        ({"parts": 4}, "parts: expected one of 2, 3, got 4"),
-        ({"rounds": -1}, "rounds: expected 0 or more"),
         ({"min_side": 0.6}, "min_side: expected a value in"),
-        ({"min_pixels": math.inf}, "min_pixels: expected 0 or more"),
+        ({"min_pixels": math.inf}, "min_pixels: expected at least 0, got inf"),
         ({"keep_share": -0.1}, "keep_share: expected a value in"),
     ):
         with pytest.raises(RangeError, match=message):

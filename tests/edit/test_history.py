@@ -32,6 +32,7 @@ from splatseg.edit import (
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.io.scene import load_scene
 from splatseg.lift import CutOptions
+from splatseg.lift.boundaries import cut
 from splatseg.render import render
 from splatseg.selection import Where, ids_named, select_where
 
@@ -77,12 +78,12 @@ EVERY = [
     Operation(
         kind="extract",
         where=OBJECT,
-        cut=CutBy(by="layer", views=("v0", "v2"), options=CutOptions(min_pixels=0, min_weight=0)),
+        cut=CutBy(by="layer", views=("v0", "v2"), options=CutOptions(min_pixels=0)),
     ),
     Operation(
         kind="split",
         where=Where(layer="picked", box=(-1.0, -1.0, -1.0, 0.0, 0.5, 0.5), invert=True),
-        cut=CutBy(by="layer", views=("v1",), options=CutOptions(rounds=1, min_pixels=0)),
+        cut=CutBy(by="layer", views=("v1",), options=CutOptions(min_pixels=0)),
     ),
 ]
 
@@ -157,8 +158,10 @@ def test_a_whole_scene_moves_with_its_cameras(document) -> None:
     )
 
 
-def test_parts_take_the_label_of_their_side(rng) -> None:
+def test_parts_take_the_label_of_their_side(rng, monkeypatch) -> None:
     """A long Gaussian of object 1 reaches into object 2: its far part becomes 2."""
+    for name, value in (("_ROUNDS", 1), ("_MIN_WEIGHT", 0), ("_BORDER_WEIGHT", 1)):
+        monkeypatch.setattr(cut, name, value)
     from .test_cut import gaussians_at
 
     row = gaussians_at(
@@ -180,7 +183,7 @@ def test_parts_take_the_label_of_their_side(rng) -> None:
         scene=Scene(gaussians=row, views=views),
         layers={"soft": soft, "hard": hard, "picked": picked},
     )
-    options = CutOptions(min_pixels=0, min_weight=0, border_weight=1, rounds=1)
+    options = CutOptions(min_pixels=0)
     for layer, wanted in (("soft", (1,)), ("hard", (1,)), ("picked", ())):
         operation = Operation(
             kind="split",
@@ -376,10 +379,10 @@ def test_masks_are_refused_after_things_moved(document) -> None:
             {
                 "kind": "split",
                 "where": {"layer": "a"},
-                "cut": {"by": "box", "options": {"parts": True}},
+                "cut": {"by": "box", "options": {"min_side": True}},
             },
             InputError,
-            "parts: expected a whole number, got True",
+            "expected a number as min_side, got True",
         ),
     ],
 )

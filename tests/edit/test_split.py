@@ -10,8 +10,7 @@ from splatseg.core import Gaussians, Selection, apply_rows
 from splatseg.core.rigid import rotation_from_quaternion
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.lift import split
-from splatseg.lift.boundaries.geometry import line_extent
-from splatseg.lift.boundaries.mixture import MIXTURES, opacities_of_parts
+from splatseg.lift.boundaries.split import MIXTURES, line_extent, opacities_of_parts
 from splatseg.render import render
 
 from .conftest import BACKEND, camera, layers_of, random_gaussians

@@ -8,9 +8,8 @@ import torch
 
 from splatseg.core import Features, LayerInfo
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.lift.affinity import AffinityHead, scale_rank
-from splatseg.lift.heads import ClassifierHead, has_classifier
-from splatseg.lift.projector import project_features, projector_start
+from splatseg.lift.affinity import AffinityHead, project_features, projector_start, scale_rank
+from splatseg.lift.label_maps import ClassifierHead, has_classifier
 
 
 def head(**changes) -> AffinityHead:

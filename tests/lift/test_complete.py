@@ -14,14 +14,15 @@ from splatseg.core import (
     LayerInfo,
 )
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.lift import CompletionOptions, complete
-from splatseg.lift.completion.graph import (
+from splatseg.lift import completion
+from splatseg.lift.completion import CompletionOptions, complete
+from splatseg.lift.neighbour_graph import (
     NodeAttributes,
     diffuse,
     neighbour_graph,
-    ranked,
     transition_matrix,
 )
+from splatseg.lift.share_tables import ranked
 
 from .conftest import gaussians_at
 
@@ -43,8 +44,18 @@ def hard(ids, *, confidence=None, evidence=None, **rest) -> Labels:
     return Labels(ids=ids, confidence=sure, evidence=evidence, **rest)
 
 
+CONSTANTS = {
+    "neighbours": "NEIGHBOURS", "spread_steps": "_SPREAD_STEPS", "colour_width": "_COLOUR_WIDTH",
+}  # fmt: skip
+
+
 def labelled(gaussians, labels, features=None, **changes) -> Labels:
-    return complete(gaussians, labels, options=CompletionOptions(**changes), features=features)
+    """Completed with other options, or constants of the module."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name in CONSTANTS.keys() & changes.keys():
+            patch.setattr(completion, CONSTANTS[name], changes.pop(name))
+        options = CompletionOptions(**changes)
+        return complete(gaussians, labels, options=options, features=features)
 
 
 def test_edges_are_as_strong_as_the_formula_says() -> None:
@@ -103,7 +114,7 @@ def test_many_in_one_place_and_few_at_all(count: int) -> None:
 
 
 def test_some_rows_of_the_graph_are_those_of_the_whole(rng, monkeypatch) -> None:
-    monkeypatch.setattr("splatseg.lift.completion.graph._ROWS", 7)
+    monkeypatch.setattr("splatseg.lift.neighbour_graph._ROWS", 7)
     nodes = NodeAttributes(
         positions=rng.normal(size=(40, 3)), colours=rng.random((40, 3), dtype=np.float32)
     )
@@ -200,9 +211,6 @@ def test_labels_go_no_farther_than_asked() -> None:
         completed = labelled(gaussians, labels, neighbours=1, spread_steps=steps)
         assert completed.ids.tolist() == [1] * (1 + steps) + [-1] * (3 - steps)
         assert completed.info.edit("complete")["unreached"] == 3 - steps
-    unsure = labelled(gaussians, labels, neighbours=1, spread_steps=2, min_inferred=0.3)
-    assert unsure.ids.tolist() == [1, 1, -1, -1]
-    assert unsure.confidence.tolist()[2:] == [0.0, 0.0]
 
 
 def test_colour_and_features_say_to_whom_a_gaussian_belongs() -> None:
@@ -224,20 +232,6 @@ def test_colour_and_features_say_to_whom_a_gaussian_belongs() -> None:
     assert labelled(gaussians, labels, nothing, neighbours=2).confidence[1] == pytest.approx(0.5)
 
 
-def test_little_evidence_does_not_speak_for_itself() -> None:
-    gaussians = on_a_line([0.0, 1.0, 2.0])
-    labels = hard([1, 7, 1], evidence=[3.0, 0.2, 3.0])
-    kept = labelled(gaussians, labels, neighbours=2)
-    assert kept.ids.tolist() == [1, 7, 1]
-    assert not bool(kept.inferred.any())
-    replaced = labelled(gaussians, labels, neighbours=2, own_evidence=0.2)
-    assert replaced.ids.tolist() == [1, 1, 1]
-    assert replaced.inferred.tolist() == [False, True, False]
-    nobody = labelled(gaussians, labels, own_evidence=3.0)
-    assert nobody.ids.tolist() == [-1, -1, -1]
-    assert nobody.confidence.tolist() == [0.0, 0.0, 0.0]
-
-
 def test_soft_layers_stay_soft_and_known_rows_stay_as_they_are() -> None:
     gaussians = on_a_line([0.0, 1.0, 2.0])
     labels = Labels(
@@ -256,12 +250,6 @@ def test_soft_layers_stay_soft_and_known_rows_stay_as_they_are() -> None:
     expected = torch.tensor([[0.7, 0.3], [0.6, 0.35], [0.9, 0.0]])
     torch.testing.assert_close(soft.shares, expected, rtol=0, atol=1e-4)
     assert soft.ids.tolist() == [4, 9, 9]
-    flat = labelled(gaussians, labels, neighbours=2, completed_layer="hard")
-    assert flat.candidates is None
-    assert flat.shares is None
-    assert flat.ids.tolist() == [4, 9, 9]
-    unsure = labelled(gaussians, labels, neighbours=2, min_inferred=0.8)
-    assert unsure.candidates.tolist() == [[4, 9], [-1, -1], [9, -1]]
 
 
 def smoothed_by_hand(labels: Labels, *, strength: float) -> torch.Tensor:
@@ -314,6 +302,16 @@ def test_completing_twice_is_completing_once(rng) -> None:
     assert torch.equal(once.inferred, twice.inferred)
 
 
+def test_what_was_inferred_without_evidence_is_inferred_anew() -> None:
+    """A layer that holds no evidence knows by its flags alone which labels are its own."""
+    gaussians, labels = on_a_line([0.0, 1.0, 2.0, 3.0]), hard([1, -1, -1, 2])
+    once = complete(gaussians, labels)
+    assert once.inferred.tolist() == [False, True, True, False]
+    twice = complete(gaussians, once)
+    assert torch.equal(twice.inferred, once.inferred)
+    assert torch.equal(twice.confidence, once.confidence)
+
+
 def test_order_of_the_gaussians_changes_nothing(rng) -> None:
     gaussians = gaussians_at(rng.normal(size=(120, 3)))
     ids = rng.integers(-1, 5, 120)
@@ -343,7 +341,7 @@ def test_what_was_done_is_recorded() -> None:
     labels = hard([1, -1], info=LayerInfo(method="uplift"))
     info = complete(on_a_line([0.0, 1.0]), labels).info
     assert info.method == "uplift"
-    assert info.edit("complete")["options"]["spread_steps"] == 50
+    assert info.edit("complete")["options"] == {"smoothing": 0.0, "smoothing_steps": 5}
 
 
 def test_bad_input_is_refused() -> None:
@@ -357,18 +355,11 @@ def test_bad_input_is_refused() -> None:
     with pytest.raises(InputError, match="smoothing: expected a layer with the evidence"):
         labelled(gaussians, hard([1, -1]), smoothing=1.0)
     for wrong in (
-        {"neighbours": 0},
-        {"spread_steps": 0},
         {"smoothing_steps": 0},
-        {"own_evidence": -1.0},
-        {"own_evidence": math.inf},
         {"smoothing": -0.1},
         {"smoothing": math.nan},
-        {"colour_width": 0.0},
-        {"feature_width": -1.0},
-        {"min_inferred": 1.5},
     ):
         with pytest.raises(RangeError, match=next(iter(wrong))):
             CompletionOptions(**wrong)
-    with pytest.raises(InputError, match="completed_layer"):
-        CompletionOptions(completed_layer="sharp")
+    with pytest.raises(InputError, match="completed_layer: this option was removed"):
+        CompletionOptions(completed_layer="hard")

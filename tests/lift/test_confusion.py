@@ -13,6 +13,7 @@ from splatseg.core import (
 )
 from splatseg.errors import InputError, RangeError
 from splatseg.lift import ConfusionOptions, correct_confusion
+from splatseg.lift.voting import confusion as module
 
 
 def soft(candidates, shares, *, evidence=None, effective_views=None, ids=None, **rest) -> Labels:
@@ -28,12 +29,10 @@ def soft(candidates, shares, *, evidence=None, effective_views=None, ids=None, *
     )
 
 
-def posterior(
-    dense: np.ndarray, mass: np.ndarray, views: np.ndarray, options: ConfusionOptions
-) -> np.ndarray:
+def posterior(dense: np.ndarray, mass: np.ndarray, views: np.ndarray) -> np.ndarray:
     """The module's equations, with loops over dense tables; impossible ids are left out."""
     rows, ids = dense.shape
-    counts = options.diagonal_prior * np.eye(ids)
+    counts = module._DIAGONAL_PRIOR * np.eye(ids)
     prior = np.ones(ids)
     for i in range(rows):
         winner = dense[i].argmax()
@@ -43,25 +42,26 @@ def posterior(
     result = np.zeros_like(dense)
     for i in range(rows):
         for t in range(ids):
-            if not (dense[i] * (theta[t] > options.min_confusion)).any():
+            if not (dense[i] * (theta[t] > module._MIN_CONFUSION)).any():
                 continue
-            likelihood = np.maximum(theta[t], options.min_confusion) ** (views[i] * dense[i])
+            likelihood = np.maximum(theta[t], module._MIN_CONFUSION) ** (views[i] * dense[i])
             result[i, t] = prior[t] * likelihood.prod()
     return result / result.sum(axis=1, keepdims=True)
 
 
 @pytest.mark.parametrize("seen", [False, True])
-@pytest.mark.parametrize(
-    "options", [{}, {"effective_views": 2.0, "diagonal_prior": 0.5, "max_evidence": 3.0}]
-)
-def test_the_posterior_is_the_formula(rng, options, seen) -> None:
+@pytest.mark.parametrize("other", [False, True])
+def test_the_posterior_is_the_formula(rng, monkeypatch, other, seen) -> None:
+    if other:
+        monkeypatch.setattr(module, "_DIAGONAL_PRIOR", 0.5)
+        monkeypatch.setattr(module, "_MAX_EVIDENCE", 3.0)
     names = np.array([2, 5, 70, 900])
     # Id 900 never meets the others: no row's support may reach across.
     dense = np.zeros((40, 4))
     dense[:30, :3] = rng.dirichlet((0.6, 0.4, 0.2), 30)
     dense[30:, 3] = 1
     evidence = rng.uniform(0, 9, 40)
-    chosen = ConfusionOptions(**options)
+    chosen = ConfusionOptions(effective_views=2.0) if other else ConfusionOptions()
     order = np.argsort(-dense, axis=1, kind="stable")
     shares = np.take_along_axis(dense, order, axis=1)
     candidates = np.where(shares > 0, names[order], -1)
@@ -77,7 +77,7 @@ def test_the_posterior_is_the_formula(rng, options, seen) -> None:
     counted = np.full(40, chosen.effective_views)
     if seen:
         counted = np.minimum(chosen.effective_views, np.maximum(views, 1))
-    expected = posterior(dense, np.minimum(evidence, chosen.max_evidence), counted, chosen)
+    expected = posterior(dense, np.minimum(evidence, module._MAX_EVIDENCE), counted)
     assert (expected.argmax(axis=1) != dense.argmax(axis=1)).any()
 
     result = correct_confusion(labels, options=chosen)
@@ -107,11 +107,9 @@ def test_defaults_are_those_that_the_figures_were_measured_with() -> None:
     assert asdict(ConfusionOptions()) == {
         "effective_views": 10.0,
         "max_correlation": 1.0,
-        "correlated_views": 3.0,
-        "min_confusion": 3e-3,
-        "diagonal_prior": 5.0,
-        "max_evidence": 20.0,
     }
+    assert (module._CORRELATED_VIEWS, module._MIN_CONFUSION) == (3.0, 3e-3)
+    assert (module._DIAGONAL_PRIOR, module._MAX_EVIDENCE) == (5.0, 20.0)
 
 
 def test_what_is_often_missed_needs_fewer_votes() -> None:
@@ -131,19 +129,20 @@ def test_one_view_is_not_ten() -> None:
     assert correct_confusion(seen).ids[18:].tolist() == [2, 1]
 
 
-def test_errors_over_ranges_of_views_leave_few_independent_ones() -> None:
+def test_errors_over_ranges_of_views_leave_few_independent_ones(monkeypatch) -> None:
     """Of a Gaussian half mouse, half desk three independent views are not enough to say mouse."""
     labels = desk_and_mouse()
+    monkeypatch.setattr(module, "_CORRELATED_VIEWS", 1.5)
     for correlation, views in ((None, 10), (-0.1, 10), (0.27, 10), (0.28, 1.5)):
-        options = ConfusionOptions(max_correlation=0.27, correlated_views=1.5)
+        options = ConfusionOptions(max_correlation=0.27)
         found = correct_confusion(labels, options=options, view_correlation=correlation)
         expected = correct_confusion(labels, options=ConfusionOptions(effective_views=views))
         assert torch.equal(found.shares, expected.shares)
         assert (found.ids[19] == 2) == (views == 10)
         facts = found.info.edit("correct_confusion")
         assert (facts["effective_views"], facts["view_correlation"]) == (views, correlation)
-    independent = ConfusionOptions(max_correlation=1.0, correlated_views=1.5)
-    found = correct_confusion(labels, options=independent, view_correlation=1.0)
+    monkeypatch.undo()
+    found = correct_confusion(labels, view_correlation=1.0)
     assert found.ids[18:].tolist() == [2, 2]
     found = correct_confusion(labels, view_correlation=0.9)
     assert found.info.edit("correct_confusion")["effective_views"] == 10.0
@@ -221,11 +220,6 @@ def test_bad_input_is_refused() -> None:
         {"effective_views": 0.0},
         {"effective_views": math.inf},
         {"max_correlation": 1.1},
-        {"correlated_views": 0.0},
-        {"diagonal_prior": -1.0},
-        {"max_evidence": 0.0},
-        {"min_confusion": 0.0},
-        {"min_confusion": 0.9},
     ):
         with pytest.raises(RangeError, match=next(iter(wrong))):
             ConfusionOptions(**wrong)

@@ -18,7 +18,7 @@ from splatseg.core import (
 )
 from splatseg.errors import InputError, ShapeError
 from splatseg.lift import GaussianField, PointLabelOptions, label_map, labels_of_points
-from splatseg.lift.heads import ClassifierHead
+from splatseg.lift.label_maps import ClassifierHead
 from splatseg.render import RenderOptions, get_backend, render
 
 from .conftest import BACKEND, BARREL, camera_at, gaussians_at, matrix_of, random_gaussians

@@ -19,15 +19,16 @@ from splatseg.core.checkpoints import Checkpoints
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.io.layers import load_layer, save_layer
 from splatseg.lift import label_map
-from splatseg.lift.heads import ClassifierHead
+from splatseg.lift.label_maps import ClassifierHead
 from splatseg.lift.training import LabelTargets, RowSampler, SamplingOptions, Values
 from splatseg.methods import MethodInputs, find_method
-from splatseg.methods._identity_loss import NeighbourLoss
-from splatseg.methods._label_models import IdentityModel
+from splatseg.methods import identity as module
 from splatseg.methods.identity import (
     PUBLISHED_CLASSIFIER_RATE,
     PUBLISHED_FEATURE_RATE,
+    IdentityModel,
     IdentityOptions,
+    NeighbourLoss,
     TrainingContext,
     identity,
     train_identity,
@@ -55,7 +56,7 @@ FAST = QUICK | {"rate": 0.05, "classifier_rate": 0.02}
 
 
 @pytest.mark.parametrize("blend", ["features", "probabilities"])
-def test_the_gradient_is_that_of_the_dense_loss(rng, views, blend) -> None:
+def test_the_gradient_is_that_of_the_dense_loss(rng, views, blend, monkeypatch) -> None:
     """Both terms, against autograd through dense matrices in float64."""
     gaussians = random_gaussians(rng)
     maps = {
@@ -72,11 +73,11 @@ def test_the_gradient_is_that_of_the_dense_loss(rng, views, blend) -> None:
         torch.from_numpy(rng.normal(size=shape).astype(np.float32))
         for shape in ((len(gaussians), 5), (3, 5), (3,))
     ]
-    neighbours = NeighbourLoss(gaussians.means, neighbours=3, points=100, rng=rng)
-    model = IdentityModel(
-        *start, blend=blend, feature_rate=1.0, classifier_rate=1.0, neighbours=neighbours,
-        neighbour_weight=2.5, neighbour_every=4, neighbour_samples=9,
-    )  # fmt: skip
+    for name, value in (("KL_EVERY", 4), ("KL_NEIGHBOURS", 3), ("KL_SAMPLES", 9)):
+        monkeypatch.setattr(module, name, value)
+    options = IdentityOptions(blend=blend, channels=5, kl_weight=2.5)
+    model = IdentityModel(gaussians.means, 3, options, rng)
+    neighbours = NeighbourLoss(gaussians.means, rng)
     for step in (3, 4):  # the neighbour term comes in the fourth
         values = Values(
             {"features": start[0]},
@@ -90,7 +91,7 @@ def test_the_gradient_is_that_of_the_dense_loss(rng, views, blend) -> None:
         leaves = [t.double().requires_grad_() for t in start]
         expected = dense_loss(batch, leaves, blend, len(gaussians))
         if step == 4:
-            pairs = neighbours.draw(9, np.random.default_rng(3))
+            pairs = neighbours.draw(np.random.default_rng(3))
             expected = expected + 2.5 * divergence_of(pairs, leaves) / 3
         expected.backward()
         mine = torch.zeros(len(gaussians), 5)
@@ -130,12 +131,13 @@ def divergence_of(pairs, leaves):
     return total
 
 
-def test_the_neighbour_term_is_scaled_as_published() -> None:
+def test_the_neighbour_term_is_scaled_as_published(monkeypatch) -> None:
     """Two Gaussians sure of different ids are far apart."""
     means = torch.tensor([[0.0, 0, 0], [1.0, 0, 0], [10.0, 0, 0]])
     rng = np.random.default_rng(0)
-    near = NeighbourLoss(means, neighbours=2, points=10, rng=rng)
-    pairs = near.draw(3, rng)
+    monkeypatch.setattr(module, "KL_NEIGHBOURS", 2)
+    near = NeighbourLoss(means, rng)
+    pairs = near.draw(rng)
     assert sorted(pairs.tolist()) == [[0, 1], [1, 0], [2, 1]]
     features = torch.tensor([[2.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
     sure = 1 / (1 + math.exp(-2.0))
@@ -149,8 +151,9 @@ def test_the_neighbour_term_is_scaled_as_published() -> None:
     expected = (divergence(there, even) + divergence(even, there)) / 6 / 2
     loss = near.loss(features, pairs, torch.eye(2), torch.zeros(2))
     assert float(loss) == pytest.approx(expected, rel=1e-5)
-    few = NeighbourLoss(means, neighbours=5, points=2, rng=rng).draw(1000, rng)
-    assert few.shape == (2, 2)
+    monkeypatch.setattr(module, "KL_NEIGHBOURS", 5)
+    monkeypatch.setattr(module, "KL_POINTS", 2)
+    assert NeighbourLoss(means, rng).draw(rng).shape == (2, 2)
 
 
 def walls():
@@ -286,17 +289,18 @@ def test_an_interrupted_training_goes_on(rng, views, tmp_path) -> None:
     gaussians, maps = random_gaussians(rng, 40), random_maps(rng, views, IDS)
     options, path = IdentityOptions(**QUICK | {"steps": 20}), tmp_path / "identity.npz"
     whole = train_identity(gaussians, views, maps, options=options, context=here())
-    asked = []
-    stopping = TrainingContext(
-        backend=BACKEND,
-        checkpoints=Checkpoints(path=path),
-        cancelled=lambda: asked.append(1) or len(asked) == 7,
-    )
+
+    def stop(done: int, _: int) -> None:
+        if done == 7:
+            raise KeyboardInterrupt
+
+    checkpoints = Checkpoints(path=path)
+    stopping = TrainingContext(backend=BACKEND, checkpoints=checkpoints, progress=stop)
     with pytest.raises(KeyboardInterrupt):
         train_identity(gaussians, views, maps, options=options, context=stopping)
     resuming = TrainingContext(backend=BACKEND, checkpoints=Checkpoints(path=path, resume=True))
-    other = IdentityOptions(**QUICK | {"steps": 20}, kl_every=3)
-    with pytest.raises(InputError, match="got one with kl_every 5 instead of 3"):
+    other = IdentityOptions(**QUICK | {"steps": 20}, kl_weight=3.0)
+    with pytest.raises(InputError, match=r"got one with kl_weight 2\.0 instead of 3"):
         train_identity(gaussians, views, maps, options=other, context=resuming)
     again = train_identity(gaussians, views, maps, options=options, context=resuming)
     assert torch.equal(whole.values, again.values)
@@ -309,8 +313,8 @@ def test_published_is_the_published_setting() -> None:
     assert (options.blend, options.channels) == ("features", 16)
     assert (options.rate, options.classifier_rate) == (2.5e-3, 5e-4)
     assert (PUBLISHED_FEATURE_RATE, PUBLISHED_CLASSIFIER_RATE) == (2.5e-3, 5e-4)
-    assert (options.kl_weight, options.kl_every, options.kl_neighbours) == (2.0, 5, 5)
-    assert (options.kl_samples, options.kl_points) == (1000, 200_000)
+    assert (options.kl_weight, module.KL_EVERY, module.KL_NEIGHBOURS) == (2.0, 5, 5)
+    assert (module.KL_SAMPLES, module.KL_POINTS) == (1000, 200_000)
     assert (options.held_out, options.patience, options.schedule) == (0.0, 0, "constant")
     assert (options.min_weight, options.sampling) == (0.0, "uniform")
     assert find_method("identity").published == IdentityOptions.published()
@@ -320,8 +324,8 @@ def test_every_option_is_heeded(rng) -> None:
     """Each gives other features than the defaults, or other drawn pixels."""
     views = [View(name=f"v{i}", camera=camera_at(0.1 * i)) for i in range(10)]
     gaussians, maps = random_gaussians(rng, 40), random_maps(rng, views, IDS)
-    base = {"steps": 12, "batch": 60, "pixels": 40, "score_every": 2, "kl_samples": 9}
-    base |= {"kl_every": 2, "patience": 0, "passes": 1, "min_weight": 0.0}
+    base = {"steps": 12, "batch": 60, "pixels": 40, "score_every": 2}
+    base |= {"patience": 0, "passes": 1, "min_weight": 0.0}
     base |= {"schedule": "constant"}
 
     def values(**changes) -> torch.Tensor:
@@ -338,17 +342,12 @@ def test_every_option_is_heeded(rng) -> None:
         {"passes": 2},
         {"min_weight": 0.1},
         {"schedule": "cosine"},
-        {"schedule": "exponential", "final_rate": 0.2},
         {"held_out": 0.3},
         {"blend": "features"},
         {"channels": 3},
         {"rate": 0.3},
         {"classifier_rate": 0.1},
         {"kl_weight": 0.0},
-        {"kl_every": 3},
-        {"kl_neighbours": 2},
-        {"kl_samples": 5},
-        {"kl_points": 20},
     ):
         other = values(**change)
         assert other.shape != first.shape or not torch.equal(other, first), change
@@ -375,11 +374,10 @@ class Recorded(Maps):
     classes = None
 
 
-@pytest.mark.parametrize("name", ["identity", "logits", "probabilities"])
-def test_the_readout_is_that_asked_for(name) -> None:
+def test_the_readout_is_that_asked_for() -> None:
     """What the command runs: labels, or features with the head that reads the same labels."""
     gaussians, views, maps, _ = walls()
-    method, told = find_method(name), []
+    method, told = find_method("identity"), []
     options = {"steps": 150, "batch": 150, "pixels": 100, "rate": 0.1}
     inputs = MethodInputs(
         gaussians=gaussians,
@@ -391,7 +389,7 @@ def test_the_readout_is_that_asked_for(name) -> None:
     )
     hard = method.run(inputs, method.options(**options))
     assert hard.ids.tolist() == [40] * 9 + [7] * 9 + [-1]
-    assert hard.info.method == name
+    assert hard.info.method == "identity"
     assert hard.info.head is None
     assert told == [(step + 1, 150) for step in range(150)]
     rendered = method.run(inputs, method.options(**options, readout="rendered"))
@@ -405,12 +403,13 @@ def test_the_readout_is_that_asked_for(name) -> None:
     assert (method.seeded, method.keeps_ids, method.evidence) == (True, True, ("labels", "tracked"))
 
 
-def test_neighbours_pull_together(rng, views) -> None:
+def test_neighbours_pull_together(rng, views, monkeypatch) -> None:
     """With a heavy neighbour term all are of one mind."""
+    monkeypatch.setattr(module, "KL_EVERY", 1)
     gaussians, maps = random_gaussians(rng), random_maps(rng, views, IDS)
 
     def spread(weight: float) -> float:
-        options = IdentityOptions(**FAST, kl_weight=weight, kl_every=1)
+        options = IdentityOptions(**FAST, kl_weight=weight)
         trained = train_identity(gaussians, views, maps, options=options, context=here())
         head = ClassifierHead.of(trained)
         return float(head.probabilities(trained.values).std(dim=0).mean())
@@ -496,10 +495,6 @@ def test_bad_input_is_refused(rng, views) -> None:
         {"rate": -1.0},
         {"classifier_rate": math.nan},
         {"kl_weight": math.inf},
-        {"kl_every": 0},
-        {"kl_neighbours": 0},
-        {"kl_samples": 0},
-        {"kl_points": 0},
         {"min_share": 2.0},
         {"memory": -1},
         {"held_out": 1.0},

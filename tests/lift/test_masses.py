@@ -5,8 +5,8 @@ import torch
 
 from splatseg.core import LabelMap, MaskSet
 from splatseg.errors import ShapeError
-from splatseg.lift.mass import pieces, segment_masses
-from splatseg.lift.mass.segment_masses import view_masses
+from splatseg.lift.voting import segment_masses
+from splatseg.lift.voting.segment_masses import view_masses
 from splatseg.render.warp import warp_into_photograph
 
 from .conftest import BACKEND, BARREL, camera_at, gaussians_at, matrix_of, random_gaussians
@@ -56,8 +56,8 @@ def test_runs_of_masks_give_the_same_bits(rng, lens, monkeypatch) -> None:
     camera, gaussians = camera_at(0.1, **lens), random_gaussians(rng)
     masks = MaskSet.from_dense(torch.from_numpy(rng.random((9, 12, 16)) < 0.4))
     together = view_masses(gaussians, camera, masks, backend=BACKEND)
-    monkeypatch.setattr(pieces, "_LAYERS", 1)
-    assert len(pieces.pieces_of(masks)) > 2
+    monkeypatch.setattr(segment_masses, "_LAYERS", 1)
+    assert len(segment_masses.pieces_of(masks)) > 2
     apart = view_masses(gaussians, camera, masks, backend=BACKEND)
     for name in ("segment", "gaussian", "weight", "visible", "covered"):
         assert torch.equal(getattr(together, name), getattr(apart, name)), name

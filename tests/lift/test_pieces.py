@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from splatseg.core import LabelMap, MaskSet
-from splatseg.lift.mass import pieces as module
-from splatseg.lift.mass.pieces import covered_pieces, pieces_of, refined
+from splatseg.lift.voting import segment_masses as module
+from splatseg.lift.voting.segment_masses import covered_pieces, pieces_of, refined
 
 
 @pytest.mark.parametrize("sets", [0, 1, 7, 200])

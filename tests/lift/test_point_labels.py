@@ -10,7 +10,7 @@ from splatseg.core import Features, Gaussians
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.evaluate.metrics import Confusion, semantic_score
 from splatseg.lift import PointLabelOptions, labels_of_points, point_labels
-from splatseg.lift.heads import ClassifierHead
+from splatseg.lift.label_maps import ClassifierHead
 from splatseg.lift.point_labels import classified_points
 
 
@@ -51,7 +51,7 @@ def at(scene, ids, points, **options) -> list[int]:
     return found.ids.tolist()
 
 
-def test_density_decides_where_the_centre_would_not() -> None:
+def test_density_decides_where_the_centre_would_not(monkeypatch) -> None:
     """A long Gaussian covers the point; a small one, whose centre is nearer, does not."""
     turn = torch.tensor([[1.0, 0, 0, 0], [math.sqrt(0.5), 0, 0, math.sqrt(0.5)]])
     # The second is long along its x, which the quarter turn about z lays along the world's y.
@@ -61,7 +61,8 @@ def test_density_decides_where_the_centre_would_not() -> None:
     ids, point = [3, 8], torch.tensor([[0.0, 0, 0]])
     assert at(scene, ids, point, rule="nearest") == [3]
     assert at(scene, ids, point) == [8]
-    assert at(scene, ids, point, neighbours=1) == [3]
+    monkeypatch.setattr("splatseg.lift.point_labels.NEIGHBOURS", 1)
+    assert at(scene, ids, point) == [3]
 
 
 def test_votes_add_up_and_ties_are_settled() -> None:
@@ -174,7 +175,6 @@ def test_bad_points_are_refused() -> None:
         with pytest.raises(error):
             labels_of_points(scene, given["ids"], given["points"])
     for options, error in (
-        ({"neighbours": 0}, RangeError),
         ({"min_opacity": 2}, RangeError),
         ({"rule": "best"}, InputError),
     ):
@@ -200,5 +200,5 @@ def test_points_that_no_gaussian_reaches_may_stay_without_a_label() -> None:
         scene, Features(values=LOGITS), head("features"), points, options=given
     )
     assert found.ids.tolist()[1:] == [-1, -1]
-    with pytest.raises(RangeError, match="max_mahalanobis: expected a positive number"):
+    with pytest.raises(RangeError, match="max_mahalanobis: expected more than 0"):
         PointLabelOptions(max_mahalanobis=0.0)

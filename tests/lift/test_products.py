@@ -5,7 +5,7 @@ import pytest
 import scipy.sparse
 
 from splatseg import _native
-from splatseg.lift.mass.products import sparse_product
+from splatseg.lift.voting.segment_masses import sparse_product
 
 
 def entries(matrix, values):

@@ -7,8 +7,8 @@ from splatseg.core import Camera, Edited, Gaussians, LayerInfo, Selection
 from splatseg.edit.operations import merged_layers
 from splatseg.io.export import label_columns
 from splatseg.io.layers import save_layer
-from splatseg.lift import GaussianField, attach, label_map
-from splatseg.lift.field_layers import selection_labels
+from splatseg.lift import GaussianField, label_map, match_gaussians
+from splatseg.lift.field import selection_labels
 from splatseg.tasks import describe
 from splatseg.tasks.export_labels import _sure_selection, label_tables
 
@@ -66,7 +66,7 @@ def test_attached_and_merged_rows_keep_it() -> None:
     gaussians, _ = wall([0.5, 0.8, 0.9])
     soft = Selection.of_confidence(torch.tensor([0.25, 0.75, 1.0]), info=LayerInfo(method="a"))
     edited = gaussians[torch.tensor([2, 0])]
-    carried = attach(gaussians, edited).carry(soft)
+    carried = match_gaussians(gaussians, edited).transfer(soft)
     assert carried.confidence.tolist() == [1.0, 0.25]
     joined = merged_layers(
         {"a": soft[:1]},

@@ -6,6 +6,7 @@ import torch
 from splatseg.core import ClassInfo, ClassTable, LabelMap, View
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.lift import UpliftOptions, uplift
+from splatseg.lift.voting import uplift as module
 from splatseg.render.warp import warp_into_photograph
 
 from .conftest import (
@@ -55,7 +56,7 @@ def test_labels_are_the_strongest_votes(rng, lens) -> None:
 
 
 @pytest.mark.parametrize("memory", [1, 14 * 4 * 2, 1 << 30])
-def test_candidates_are_exact_whatever_the_memory(rng, views, memory) -> None:
+def test_candidates_are_exact_whatever_the_memory(rng, views, memory, monkeypatch) -> None:
     """Fewer ids than slots: what each Gaussian remembers is all there is. One pass."""
     gaussians = random_gaussians(rng)
     maps = random_maps(rng, views, IDS)
@@ -64,11 +65,12 @@ def test_candidates_are_exact_whatever_the_memory(rng, views, memory) -> None:
     expected, order = shares.sort(dim=1, descending=True, stable=True)
 
     calls = []
+    monkeypatch.setattr(module, "SLOTS", 4)
     labels = uplift(
         gaussians,
         views,
         maps,
-        options=UpliftOptions(candidates=3, memory=memory, slots=4),
+        options=UpliftOptions(candidates=3, memory=memory),
         backend=BACKEND,
         progress=lambda done, total: calls.append((done, total)),
     )
@@ -117,7 +119,7 @@ def test_a_pixel_votes_with_its_confidence() -> None:
     assert labels.background == 1
     assert facts["share"] == pytest.approx(0.75, abs=1e-6)
     light = float((passing * confidence).sum() / confidence.sum())
-    assert facts["light"] == pytest.approx(light, abs=1e-6)
+    assert facts["uncovered_share"] == pytest.approx(light, abs=1e-6)
 
 
 def test_equal_votes_go_to_the_smaller_id() -> None:
@@ -166,7 +168,7 @@ def test_thresholds_take_labels_away() -> None:
     assert unsure.shares.tolist() == [[0.0, 0.0]]
 
 
-def test_the_sky_is_what_passes() -> None:
+def test_the_sky_is_what_passes(monkeypatch) -> None:
     """Sky above, a wall of Gaussians below: the light that passes is nearly all sky's."""
     wall = [[x, y, 2.0] for x in torch.arange(-1.4, 1.5, 0.2) for y in torch.arange(0.1, 1.2, 0.2)]
     gaussians = gaussians_at(wall, opacity=0.99)
@@ -180,17 +182,19 @@ def test_the_sky_is_what_passes() -> None:
     matrix = matrix_of(gaussians, view.camera)
     residual = 1 - matrix.sum(dim=-1)
     facts = labels.info.details["background_votes"]
-    assert facts["light"] == pytest.approx(float(residual.mean()), abs=1e-6)
+    assert facts["uncovered_share"] == pytest.approx(float(residual.mean()), abs=1e-6)
     assert facts["share"] == pytest.approx(float(residual[:6].sum() / residual.sum()), abs=1e-6)
 
-    def background(**changes) -> int:
-        options = UpliftOptions(**changes)
-        return uplift(gaussians, [view], maps, options=options, backend=BACKEND).background
+    def background(name: str, value: float) -> int:
+        monkeypatch.setattr(module, name, value)
+        found = uplift(gaussians, [view], maps, backend=BACKEND).background
+        monkeypatch.undo()
+        return found
 
-    assert background(min_background=facts["light"] * 0.99) == 2
-    assert background(min_background=facts["light"] * 1.01) == -1
-    assert background(min_background_share=facts["share"] * 0.99) == 2
-    assert background(min_background_share=min(1.0, facts["share"] * 1.01)) == -1
+    assert background("_MIN_UNCOVERED", facts["uncovered_share"] * 0.99) == 2
+    assert background("_MIN_UNCOVERED", facts["uncovered_share"] * 1.01) == -1
+    assert background("_MIN_BACKGROUND_SHARE", facts["share"] * 0.99) == 2
+    assert background("_MIN_BACKGROUND_SHARE", facts["share"] * 1.01) == -1
 
 
 def test_reduced_label_maps_vote_through_a_reduced_camera(rng) -> None:
@@ -234,8 +238,6 @@ def test_bad_input_is_refused(rng, views) -> None:
         {"min_weight": -1.0},
         {"min_weight": float("nan")},
         {"min_share": 1.1},
-        {"min_background": -0.1},
-        {"min_background_share": 2.0},
         {"memory": 0},
     ):
         with pytest.raises(RangeError, match=next(iter(wrong))):

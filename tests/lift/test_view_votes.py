@@ -8,7 +8,7 @@ import torch
 
 from splatseg.core import Camera, LabelMap, View
 from splatseg.lift import UpliftOptions, uplift
-from splatseg.lift.mass.view_votes import ViewVotes
+from splatseg.lift.voting.confusion import ViewVotes
 
 from .conftest import BACKEND, Maps, camera_at, gaussians_at, matrix_of
 
@@ -31,7 +31,7 @@ def angle_of(camera: Camera) -> float:
     return float(np.arctan2(y, x) % (2 * np.pi))
 
 
-def correlation(votes_for_second, *, views=24, count=80, dense=True) -> float | None:
+def correlation(votes_for_second, *, views=24, count=80) -> float | None:
     """Rho of Gaussians at the origin, for the second id where `votes_for_second(row, camera)`."""
     votes = ViewVotes(torch.zeros(count, 3))
     total = torch.zeros(count, 2)
@@ -40,22 +40,18 @@ def correlation(votes_for_second, *, views=24, count=80, dense=True) -> float | 
         second = torch.tensor([bool(votes_for_second(row, camera)) for row in range(count)])
         sums = torch.stack((~second, second), dim=1).float()
         total += sums
-        if dense:
-            votes.add((DESK, NIGHTSTAND), 0.3 * sums, rows=rows)
-        else:
-            ids = torch.where(second, NIGHTSTAND, DESK)
-            votes.add_sparse(ids, rows, torch.full((count,), 0.3))
+        ids = torch.where(second, NIGHTSTAND, DESK)
+        votes.add_sparse(ids, rows, torch.full((count,), 0.3))
         votes.end_view(camera)
     shares, order = (total / views).sort(dim=1, descending=True, stable=True)
     candidates = torch.tensor([DESK, NIGHTSTAND])[order]
     return votes.correlation(torch.where(shares > 0, candidates, -1), shares)
 
 
-@pytest.mark.parametrize("dense", [True, False])
-def test_errors_of_a_range_of_views_correlate(dense) -> None:
+def test_errors_of_a_range_of_views_correlate() -> None:
     """A third of the ring calls it nightstand. Of 24 views only those at the two ends of the
     range may have a nearest view that votes otherwise."""
-    found = correlation(lambda _, camera: angle_of(camera) < 2 * np.pi / 3 - 0.01, dense=dense)
+    found = correlation(lambda _, camera: angle_of(camera) < 2 * np.pi / 3 - 0.01)
     assert found is not None
     by_chance = (8 * 7 + 16 * 15) / (24 * 23)
     assert (20 / 24 - by_chance) / (1 - by_chance) - 1e-9 <= found <= 1.0

@@ -8,8 +8,8 @@ import torch
 
 from splatseg.core import Camera, ClassInfo, ClassTable, LabelMap, View
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.lift.mass.centres import centre_weights, centres_in, majority_map
-from splatseg.methods.vote import VoteOptions, vote
+from splatseg.methods import vote as module
+from splatseg.methods.vote import VoteOptions, centre_weights, centres_in, vote
 from splatseg.render import RenderOptions, prepare, weights
 
 from .conftest import (
@@ -35,8 +35,17 @@ def votes_of(*maps: LabelMap) -> tuple[list[View], Maps]:
     return views, Maps({view.name: label_map for view, label_map in zip(views, maps, strict=True)})
 
 
+CONSTANTS = {
+    "memory": "_MEMORY", "min_weight": "_MIN_WEIGHT", "depth_tolerance": "_DEPTH_TOLERANCE",
+}  # fmt: skip
+
+
 def voted(gaussians, views, maps, **changes):
-    return vote(gaussians, views, maps, options=VoteOptions(**changes), backend=BACKEND)
+    """Votes with other options, or constants of the module."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name in CONSTANTS.keys() & changes.keys():
+            patch.setattr(module, CONSTANTS[name], changes.pop(name))
+        return vote(gaussians, views, maps, options=VoteOptions(**changes), backend=BACKEND)
 
 
 LEFT, RIGHT = [-5 / 14.4, 1 / 14.4, 2.0], [5 / 14.4, 1 / 14.4, 2.0]
@@ -94,16 +103,12 @@ def test_published_votes_are_of_all_views() -> None:
     assert VoteOptions().needed_share == 0.0
 
 
-def test_void_pixels_say_nothing_or_no() -> None:
+def test_void_pixels_say_nothing() -> None:
     views, maps = votes_of(halves(1, -1), halves(-1, -1), halves(-1, -1))
     gaussians = gaussians_at([LEFT, RIGHT])
     labels = voted(gaussians, views, maps)
     assert labels.ids.tolist() == [1, -1]
     assert labels.confidence.tolist() == [1.0, 0.0]
-    against = voted(gaussians, views, maps, count_void=True)
-    assert against.ids.tolist() == [1, -1]
-    assert against.confidence.tolist() == pytest.approx([1 / 3, 0.0])
-    assert voted(gaussians, views, maps, count_void=True, share=0.5).ids.tolist() == [-1, -1]
 
 
 def test_what_is_hidden_is_not_asked() -> None:
@@ -142,13 +147,12 @@ def test_transmittance_weighs_the_votes(rng, views) -> None:
             if 0 <= u < 16 and 0 <= v < 12:
                 id = int(maps.label_map(view.name).ids[v, u])
                 votes[i, id - 1] += matrix[v, u, i]
-    labels = voted(gaussians, views, maps, weight="transmittance", candidates=3)
+    labels = voted(gaussians, views, maps, weight="transmittance")
     assert labels.evidence is not None
-    assert labels.shares is not None
     torch.testing.assert_close(labels.evidence.double(), votes.sum(dim=1), rtol=0, atol=5e-3)
     shares = votes / votes.sum(dim=1, keepdim=True).clamp_min(1e-9)
-    expected = shares.sort(dim=1, descending=True).values
-    torch.testing.assert_close(labels.shares.double(), expected, rtol=0, atol=5e-3)
+    expected = shares.max(dim=1).values
+    torch.testing.assert_close(labels.confidence.double(), expected, rtol=0, atol=5e-3)
     unseen = votes.sum(dim=1) == 0
     assert bool((labels.ids[unseen] == -1).all())
     minimum = voted(gaussians, views, maps, occlusion="weight", min_weight=0.5)
@@ -194,35 +198,14 @@ def test_near_and_border() -> None:
     assert centres_in(means, camera, near=0.25).gaussians.tolist() == [0, 2]
 
 
-def test_regions_vote_for_their_commonest_id() -> None:
-    ids = torch.tensor([[1, 1, 2], [3, 2, 2], [-1, -1, -1]], dtype=torch.int32)
-    assert torch.equal(majority_map(ids, 0), ids)
-    # Counted by hand: corners have four pixels, edges six, the middle nine (three -1, three 2).
-    expected = torch.tensor([[1, 2, 2], [-1, -1, 2], [-1, -1, -1]], dtype=torch.int32)
-    assert torch.equal(majority_map(ids, 1), expected)
-    whole = torch.where(torch.rand(12, 16, generator=torch.Generator().manual_seed(1)) < 0.6, 7, 2)
-    assert bool((majority_map(whole, 20) == 7).all())
-    speck = halves(1, 2).ids.clone()
-    views, maps = votes_of(LabelMap(ids=speck))
-    gaussians = gaussians_at([LEFT])
-    column, row = views[0].camera.project(gaussians.means)[0][0].floor().long().tolist()
-    speck[row, column] = 9
-    maps = Maps({"v0": LabelMap(ids=speck)})
-    assert voted(gaussians, views, maps).ids.tolist() == [9]
-    assert voted(gaussians, views, maps, region=1).ids.tolist() == [1]
-
-
 def test_confidence_and_reduced_maps() -> None:
     sure = torch.full((12, 16), 0.9)
     views, maps = votes_of(
         halves(1, 1, confidence=sure), halves(2, 2, confidence=0.5 * sure), halves(2, 2)
     )
-    labels = voted(gaussians_at([LEFT]), views, maps, candidates=2)
+    labels = voted(gaussians_at([LEFT]), views, maps)
     assert labels.ids.tolist() == [2]
-    assert labels.candidates is not None
-    assert labels.shares is not None
-    assert labels.candidates.tolist() == [[2, 1]]
-    assert labels.shares[0].tolist() == pytest.approx([1.45 / 2.35, 0.9 / 2.35])
+    assert labels.confidence.tolist() == pytest.approx([1.45 / 2.35])
     full = [View(name="v0", camera=camera_at(width=32, height=24))]
     assert voted(gaussians_at([RIGHT]), full, Maps({"v0": halves(1, 2)})).ids.tolist() == [2]
 
@@ -231,7 +214,7 @@ def test_order_of_views_changes_nothing(rng, views) -> None:
     gaussians = random_gaussians(rng, 20)
     maps = random_maps(rng, views, (1, 2, 3))
     calls = []
-    options = VoteOptions(weight="transmittance", candidates=2)
+    options = VoteOptions(weight="transmittance")
     a = vote(gaussians, views, maps, options=options, backend=BACKEND)
     b = vote(
         gaussians,
@@ -242,7 +225,7 @@ def test_order_of_views_changes_nothing(rng, views) -> None:
         progress=lambda done, total: calls.append((done, total)),
     )
     assert torch.equal(a.ids, b.ids)
-    assert torch.equal(a.shares, b.shares)
+    assert torch.equal(a.confidence, b.confidence)
     assert calls == [(1, 3), (2, 3), (3, 3)]
 
 
@@ -278,15 +261,7 @@ def test_bad_input_is_refused(rng, views) -> None:
     broken = gaussians.replace(means=torch.full_like(gaussians.means, math.nan))
     with pytest.raises(RangeError, match="means"):
         vote(broken, views[:2], maps, backend=BACKEND)
-    for wrong in (
-        {"share": 1.1},
-        {"min_weight": -0.1},
-        {"depth_tolerance": -1.0},
-        {"depth_tolerance": math.inf},
-        {"region": -1},
-        {"candidates": 0},
-        {"memory": 0},
-    ):
+    for wrong in ({"share": 1.1},):
         with pytest.raises(RangeError, match=next(iter(wrong))):
             VoteOptions(**wrong)
     for wrong in ({"rule": "most"}, {"occlusion": "x"}, {"weight": "two"}):

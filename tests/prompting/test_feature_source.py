@@ -5,10 +5,12 @@ import torch
 
 from splatseg.core import FeatureMap, Features, LayerInfo
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.lift.affinity import AffinityHead
-from splatseg.lift.projector import projector_shapes
+from splatseg.lift.affinity import AffinityHead, projector_shapes
 from splatseg.prompting import feature_source
-from splatseg.prompting.feature_source import FeatureMembership, FeatureMembershipOptions
+from splatseg.prompting.feature_source import (
+    FeatureMembership,
+    FeatureMembershipOptions,
+)
 from splatseg.prompting.prompts import ViewPrompt
 from splatseg.prompting.seen import see_prompts
 from support.wall import HEIGHT, SKY_ROWS, WIDTH, field_ids

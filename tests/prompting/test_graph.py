@@ -8,7 +8,7 @@ import torch
 
 from splatseg.core import Selection
 from splatseg.errors import RangeError, ShapeError
-from splatseg.lift.completion.graph import NodeAttributes, flat_normals, neighbour_graph
+from splatseg.lift.neighbour_graph import NodeAttributes, flat_normals, neighbour_graph
 from splatseg.prompting import graph as module
 from splatseg.prompting.graph import build_graph, complete_membership, holes, specks
 from splatseg.selection import components

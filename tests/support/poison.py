@@ -498,7 +498,6 @@ def inner(world: World, by_type: dict[type, Any]) -> dict[str, Any]:
         "models.record_evidence.model": find_model("classical"),
         "models.record_evidence.folder": world.path(),
         "lift.MatchedMaps.source": EvidenceSegments(evidence=world.masks),
-        "lift.cut_labels.labels": soft,
         "evaluate.contested.labels": soft,
         "lift.correct_confusion.labels": soft,
         "lift.EvidenceSegments.evidence": world.masks,

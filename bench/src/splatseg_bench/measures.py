@@ -37,7 +37,7 @@ from splatseg.evaluate.held_out import Progress, label_map_in
 from splatseg.evaluate.metrics import Confusion, SemanticScore, id_pair, semantic_score
 from splatseg.evaluate.overlaps import InstanceScore, Overlaps, best_pairs
 from splatseg.lift.affinity import KIND, AffinityHead
-from splatseg.lift.heads import ClassifierHead, has_classifier
+from splatseg.lift.label_maps import ClassifierHead, has_classifier
 from splatseg.neighbours import NeighbourIndex
 
 

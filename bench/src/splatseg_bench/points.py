@@ -26,7 +26,7 @@ from splatseg.io.arrays import save_arrays
 from splatseg.io.atomic import atomic_file, path_inside
 from splatseg.io.evidence import open_evidence
 from splatseg.lift import GaussianField
-from splatseg.lift.heads import ClassifierHead, has_classifier
+from splatseg.lift.label_maps import ClassifierHead, has_classifier
 from splatseg_bench.evidence import Seen, evidence_wanted
 from splatseg_bench.job import Job, word_index, words_of
 from splatseg_bench.protocols import PointSwitches

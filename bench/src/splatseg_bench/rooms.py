@@ -23,7 +23,7 @@ from splatseg.errors import InputError, MissingFileError
 from splatseg.evaluate import Confusion, PanopticReport, evaluate_panoptic
 from splatseg.io.evidence import Evidence, TrackedEvidence, open_evidence
 from splatseg.lift import GaussianField
-from splatseg.lift.heads import has_classifier
+from splatseg.lift.label_maps import has_classifier
 from splatseg.render import get_backend
 from splatseg_bench.evidence import Seen, evidence_wanted
 from splatseg_bench.job import Job

@@ -24,7 +24,7 @@ from splatseg.io.atomic import path_inside
 from splatseg.io.evidence import create_evidence, save_label_map
 from splatseg.io.images import save_png
 from splatseg.lift import GaussianField, TextSpace
-from splatseg.lift.heads import has_classifier
+from splatseg.lift.label_maps import has_classifier
 from splatseg.methods.prompt import mask_points
 from splatseg.prompting.prompts import ViewPrompt
 from splatseg_bench.answers import (

@@ -17,7 +17,7 @@ from splatseg.cli._shared import (
     Strict,
     print_result,
 )
-from splatseg.lift import AttachOptions
+from splatseg.lift import MatchOptions
 from splatseg.tasks import (
     AttachedLayers,
     AttachLayersOptions,
@@ -136,7 +136,7 @@ class AttachCommand(Printing):
     attaching: Annotated[_Attach, tyro.conf.arg(name="")] = field(default_factory=_Attach)
     """Layers to attach, and how much must be found."""
 
-    search: AttachOptions = field(default_factory=AttachOptions)
+    search: MatchOptions = field(default_factory=MatchOptions)
     """Limits of the search."""
 
 

@@ -17,7 +17,7 @@ from splatseg.core.instance_tree import layer_kind
 from splatseg.errors import InputError
 from splatseg.io.evidence import open_evidence
 from splatseg.io.scene_folder import work_on_scene
-from splatseg.lift import CompletionOptions
+from splatseg.lift.completion import CompletionOptions
 from splatseg.methods import Method, find_method, methods
 from splatseg.report.words import counted
 from splatseg.tasks import (

@@ -160,7 +160,7 @@ class LayerInfo:
     at most 1; None where it was not measured."""
 
     head: Mapping[str, JSON] | None = None
-    """With features: what reads them, as `lift.heads.ClassifierHead.to_json` (ids) or
+    """With features: what reads them, as `lift.label_maps.ClassifierHead.to_json` (ids) or
     `lift.affinity.AffinityHead.to_json` (what belongs together) writes it."""
 
     edits: tuple[LayerEdit, ...] = ()

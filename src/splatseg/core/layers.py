@@ -73,7 +73,7 @@ class Labels(RowColumns, Previewed):
 
     shares: Float[Tensor, "n k"] | None = None
     """Their shares of the evidence, which add up to at most 1; of memberships that were solved for
-    each by itself (`lift.memberships`), to a little more."""
+    each by itself (`methods.associate`), to a little more."""
 
     evidence: Float[Tensor, "n"] | None = None
     """Total evidence for any id: blending weight summed over voting pixels and views. One fully

@@ -23,8 +23,7 @@ from splatseg.edit.document import CutBy, Document, Operation
 from splatseg.errors import InputError
 from splatseg.io.evidence import find_evidence, open_evidence
 from splatseg.lift import label_map
-from splatseg.lift.boundaries.box import cut_box
-from splatseg.lift.boundaries.cut import cut_masks
+from splatseg.lift.boundaries.cut import cut_box, cut_masks
 from splatseg.selection import Where, layer_called, leftovers, select_where
 
 Progress = Callable[[int, int], None]
@@ -175,7 +174,7 @@ def _check_some(selection: Selection, where: Where) -> None:
 def _cut_layer(task: _Task, named: Selection) -> tuple[Edited, Selection, int]:
     """Split at the boundary of what a layer names; which Gaussians are inside afterwards."""
     scene, cut = task.document.scene, task.cut
-    if cut.by == "box" or cut.options.rounds == 0:
+    if cut.by == "box":
         return Edited.unchanged(scene.gaussians), named, 0
     views = [scene.view(name) for name in cut.views]
     evidence, ids = _boundary(task, named, views)

@@ -1,14 +1,18 @@
-r"""A layer of features that tell which Gaussians belong together, and what reads them.
+r"""Features that are compared (SAGA): the head that reads them, and its projector (eq. 4).
 
-Such features (SAGA's, `methods.saga`) have no classes: two of them are compared,
+Two hidden layers of 64, each a linear map, layer normalisation and a leaky ReLU, and a linear map:
 
-.. math:: \cos\bigl(g(s) \odot f_i, \; g(s) \odot f_j\bigr), \qquad g(s) = \sigma(w s + b),
+.. math:: \varphi(x) = A_2 \, h_1(h_0(x)) + b_2, \qquad
+          h_k(x) = \mathrm{LeakyReLU}(\mathrm{LayerNorm}(A_k x + b_k)) .
 
-where the gate g keeps the channels that matter at the scale s of what is looked for: 0 the
-smallest things of the scene, 1 the largest. Scales mean the same in every scene: they are levels
-(0 parts, 0.5 objects, 1 groups), or ranks of size: `AffinityHead.scale_of` has these of lengths.
+Its weights are plain arrays by name, so that a training steps them and the info of a layer holds
+them.
+
+References:
+    Cen et al., Segment Any 3D Gaussians (2023), eq. 4, and the published code for the widths.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, cast
@@ -17,13 +21,79 @@ import numpy as np
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
-from torch.nn.functional import normalize
+from torch.nn.functional import layer_norm, leaky_relu, normalize
 
 from splatseg._check import check_finite, check_range, check_shape
 from splatseg.core import JSON, Features
 from splatseg.core.boundary import boundary, convert_fields
-from splatseg.errors import InputError, RangeError
-from splatseg.lift.projector import project_features, projector_shapes
+from splatseg.core.options import Count, Share
+from splatseg.errors import InputError, RangeError, ShapeError
+
+HIDDEN = 64
+"""Width of both hidden layers, as published."""
+
+
+def projector_shapes(inputs: int, outputs: int) -> dict[str, tuple[int, ...]]:
+    """The arrays of a projector, by name.
+
+    Args:
+        inputs: Channels of the 2D features.
+        outputs: Channels of a Gaussian's feature.
+    """
+    return {
+        "weight0": (HIDDEN, inputs),
+        "bias0": (HIDDEN,),
+        "gain0": (HIDDEN,),
+        "shift0": (HIDDEN,),
+        "weight1": (HIDDEN, HIDDEN),
+        "bias1": (HIDDEN,),
+        "gain1": (HIDDEN,),
+        "shift1": (HIDDEN,),
+        "weight2": (outputs, HIDDEN),
+        "bias2": (outputs,),
+    }
+
+
+def projector_start(inputs: int, outputs: int, rng: np.random.Generator) -> dict[str, Tensor]:
+    """What a projector's arrays start as.
+
+    Linear maps are uniform within 1 / sqrt(inputs); normalisation changes nothing at first.
+    """
+    start: dict[str, Tensor] = {}
+    width = inputs
+    for name, shape in projector_shapes(inputs, outputs).items():
+        if name.startswith("weight"):
+            width = shape[1]
+        if name.startswith(("gain", "shift")):
+            start[name] = torch.full(shape, float(name.startswith("gain")))
+        else:
+            bound = 1 / math.sqrt(width)
+            start[name] = torch.from_numpy(rng.uniform(-bound, bound, shape).astype(np.float32))
+    return start
+
+
+def project_features(
+    arrays: Mapping[str, Tensor], features: Float[Tensor, "*batch inputs"]
+) -> Float[Tensor, "*batch outputs"]:
+    """The projector's output, differentiable.
+
+    Args:
+        arrays: Those that `projector_shapes` names.
+        features: 2D features, channels last.
+
+    Raises:
+        ShapeError: If the features have other channels than the projector takes.
+    """
+    inputs = arrays["weight0"].shape[1]
+    if features.shape[-1] != inputs:
+        raise ShapeError(f"features: expected {inputs} channels, got {features.shape[-1]}.")
+    found = features
+    for layer in (0, 1):
+        found = found @ arrays[f"weight{layer}"].T + arrays[f"bias{layer}"]
+        found = layer_norm(found, (HIDDEN,), arrays[f"gain{layer}"], arrays[f"shift{layer}"])
+        found = leaky_relu(found)
+    return found @ arrays["weight2"].T + arrays["bias2"]
+
 
 KIND = "affinity"
 """What tells this head from a classifier's in the info of a layer."""
@@ -34,9 +104,19 @@ QUANTILES = 101
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class AffinityHead:
-    """Reads features by comparing them."""
+    r"""Reads features by comparing them.
 
-    channels: int
+    Such features (SAGA's, `methods.saga`) have no classes: two of them are compared,
+
+    .. math:: \cos\bigl(g(s) \odot f_i, \; g(s) \odot f_j\bigr), \qquad g(s) = \sigma(w s + b),
+
+    where the gate g keeps the channels that matter at the scale s of what is looked for: 0 the
+    smallest things of the scene, 1 the largest. Scales mean the same in every scene: they are
+    levels (0 parts, 0.5 objects, 1 groups), or ranks of size: `AffinityHead.scale_of` has these of
+    lengths.
+    """
+
+    channels: Count
     """Width of a feature."""
 
     unit: bool
@@ -52,7 +132,7 @@ class AffinityHead:
     """Percentiles of the scales of masks, in scene units, ascending; None where none were
     measured, or scales are levels."""
 
-    levels: tuple[float, float, float] = (0.5, 0.5, 0.5)
+    levels: tuple[Share, Share, Share] = (0.5, 0.5, 0.5)
     """The scales, in [0, 1], that stand for groups, objects and their finest parts."""
 
     projector: Mapping[str, Tensor] = field(default_factory=dict[str, Tensor])
@@ -61,8 +141,6 @@ class AffinityHead:
 
     def __post_init__(self) -> None:
         convert_fields(self)
-        if self.channels < 1:
-            raise RangeError(f"channels: expected at least 1, got {self.channels}.")
         if (self.gate_weight is None) != (self.gate_bias is None):
             raise InputError("gate_weight, gate_bias: expected both or none of them.")
         for name in ("gate_weight", "gate_bias"):
@@ -74,8 +152,6 @@ class AffinityHead:
             check_finite("scale_quantiles", self.scale_quantiles)
             if bool((self.scale_quantiles.diff() < 0).any()):
                 raise RangeError("scale_quantiles: expected ascending numbers, got others.")
-        for scale in self.levels:
-            check_range("levels", scale, 0.0, 1.0)
         if self.projector:
             _check_projector(self.projector, self.channels)
 

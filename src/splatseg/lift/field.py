@@ -1,33 +1,188 @@
 """Gaussians with their layers as a field: `splatseg.core.Renderable`.
 
-A view is projected and sorted once (`splatseg.render.prepare`); colour, depth and all layers of
-the view are products with it, each exactly what `render` and `label_map` give on their own.
+A view is projected and sorted once (`splatseg.render.prepare`); colour, depth and all layers of the
+view are products with it, each exactly what `render` and `label_map` give on their own.
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 from types import TracebackType
-from typing import Self
+from typing import Literal, Self
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from splatseg.core import (
+    UNLABELLED,
     Camera,
+    Features,
     Gaussians,
     LabelMap,
     Labels,
     Layer,
     PointLabels,
     RenderableLayer,
+    Selection,
     ViewSignals,
+    VoxelFeatures,
+    flat_layer,
+    plain_features,
+    tree_level,
 )
 from splatseg.core.boundary import boundary
-from splatseg.errors import ShapeError
-from splatseg.lift.field_layers import FieldLayer, field_layer
-from splatseg.lift.point_labels import PointLabelOptions
-from splatseg.lift.view_renderer import ViewRenderer
+from splatseg.errors import InputError, ShapeError
+from splatseg.lift.label_maps import ClassifierHead, ViewRenderer, has_classifier, view_label_map
+from splatseg.lift.point_labels import PointLabelOptions, classified_points, labels_of_points
 from splatseg.render import PreparedView, RenderOptions, prepare
+
+Readout = Literal["hard", "rendered"]
+"""How features with a classifier are read. hard: labels of Gaussians are rendered. rendered: the
+head's way, `ClassifierHead.label_map`."""
+
+_READOUTS = ("hard", "rendered")
+
+
+class FieldLayer:
+    """A layer of a field of Gaussians, read in views and at points.
+
+    It is labels, a selection, or features, which are read by their classifier if they have one.
+
+    Args:
+        name: What errors call it.
+        layer: The layer.
+    """
+
+    def __init__(self, name: str, layer: Labels | Selection | Features | VoxelFeatures) -> None:
+        self._name = name
+        self._layer = layer
+        self._head: ClassifierHead | None = None
+        if isinstance(layer, Features) and has_classifier(layer):
+            self._head = ClassifierHead.of(layer)
+
+    @property
+    def summary(self) -> RenderableLayer:
+        """What there is to know of it."""
+        if self._head is not None:
+            return RenderableLayer(
+                ids=tuple(sorted(set(self._head.ids.tolist()))),
+                background=self._head.background,
+                info=self._layer.info,
+            )
+        if isinstance(self._layer, (Labels, Selection)):
+            return RenderableLayer.of(self._layer)
+        return RenderableLayer(kind="features", info=self._layer.info)
+
+    @cached_property
+    def labels(self) -> Labels:
+        """Labels of Gaussians: of features the hard readout.
+
+        Raises:
+            InputError: If they are features without a classifier.
+        """
+        match self._layer:
+            case Labels():
+                return self._layer
+            case Selection():
+                return selection_labels(self._layer)
+            case Features() if self._head is not None:
+                recorded = self._layer.info.options.get("min_share")
+                least = float(recorded) if isinstance(recorded, int | float) else 0.0
+                return self._head.labels(self._layer, min_share=least)
+            case _:
+                raise InputError(
+                    f"layer {self._name!r}: expected labels, a selection, or features with a "
+                    "classifier, got features without one, which have no label maps."
+                )
+
+    @cached_property
+    def _log_totals(self) -> Tensor | None:
+        head = self._head
+        if head is None or head.blend != "probabilities" or not isinstance(self._layer, Features):
+            return None
+        return head.log_totals(self._layer)
+
+    def features(self, view: ViewRenderer) -> Float[Tensor, "height width channels"]:
+        """Its features, blended in a view."""
+        if isinstance(self._layer, (Labels, Selection)):
+            raise InputError(f"layer {self._name!r}: expected features, got labels.")
+        return view.scores(plain_features(self._layer).values)[0]
+
+    def label_map(self, view: ViewRenderer) -> LabelMap:
+        """Its ids in a view."""
+        if self._head is None or not isinstance(self._layer, Features):
+            return view_label_map(view.view, self.labels)
+        return self._head.view_label_map(view, self._layer, log_totals=self._log_totals)
+
+    def confidence(
+        self, view: ViewRenderer, shown: LabelMap
+    ) -> tuple[Float[Tensor, "height width"], Float[Tensor, "height width"]]:
+        """How sure the labels in a view are, and alpha.
+
+        Args:
+            view: The view.
+            shown: The label map there.
+        """
+        if self._head is not None:
+            alpha = view.scores(torch.zeros(len(self._layer), 1))[1]
+            return alpha if shown.confidence is None else shown.confidence, alpha
+        # The mean over the Gaussians that a pixel shows, by their weights.
+        sums, alpha = view.scores(self.labels.confidence[:, None])
+        return (sums[..., 0] / alpha.clamp_min(1e-6)).clamp(0, 1), alpha
+
+    def labels_at(
+        self, gaussians: Gaussians, points: Float[Tensor, "p 3"], options: PointLabelOptions
+    ) -> PointLabels:
+        """Its labels of points."""
+        if self._head is None or not isinstance(self._layer, Features):
+            return labels_of_points(gaussians, self.labels.ids, points, options=options)
+        return classified_points(gaussians, self._layer, self._head, points, options=options)
+
+
+def field_layer(layers: Mapping[str, Layer], address: str) -> FieldLayer:
+    """The layer of an address, see `splatseg.lift.GaussianField`.
+
+    Raises:
+        InputError: If there is none.
+    """
+    name, at, part = address.partition("@")
+    layer = layers.get(name)
+    if layer is None:
+        known = ", ".join(layers) or "there is none"
+        raise InputError(f"layer: expected one of the field ({known}), got {name!r}.")
+    if isinstance(layer, VoxelFeatures):
+        return FieldLayer(name, layer)
+    if not isinstance(layer, Features):
+        return FieldLayer(name, flat_layer(layer, tree_level(part) if at else None, name=name))
+    if at and part not in _READOUTS:
+        raise InputError(
+            f"layer {name!r}: expected a readout of features after the @ "
+            f"({', '.join(_READOUTS)}), got {part!r}."
+        )
+    found = FieldLayer(name, layer)
+    if part == "hard" and has_classifier(layer):
+        return FieldLayer(name, found.labels)
+    return found
+
+
+def selection_labels(selection: Selection) -> Labels:
+    """A selection as labels, 1 inside and none outside, to be rendered as a mask.
+
+    Where it has confidences the labels are soft: a pixel is inside where the blended probability
+    is more than half of all its light, the transmittance behind all Gaussians counting as outside.
+    """
+    ids = torch.where(selection.mask, 1, UNLABELLED)
+    if selection.confidence is None:
+        return Labels(ids=ids, confidence=selection.mask.float(), info=selection.info)
+    shares = selection.confidence.float()
+    return Labels(
+        ids=ids,
+        confidence=shares,
+        candidates=torch.ones_like(ids, dtype=torch.int32).unsqueeze(1),
+        shares=shares.unsqueeze(1),
+        info=selection.info,
+    )
+
 
 _COVERED = 0.02
 """Alpha up to which a pixel shows nothing to be sure of."""

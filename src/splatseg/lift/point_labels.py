@@ -7,7 +7,8 @@ The nearest Gaussians vote with their density at the point x, as they do in a la
           \qquad \mathrm{id}(x) = \arg\max_c \sum_i d_i(x)\, a_{ic}
 
 with :math:`a_{ic}` as in `splatseg.lift.label_map`: 1 for the id of a Gaussian. Trained features
-are read as in views (`splatseg.lift.heads`), with :math:`d_i / \sum_j d_j` for blending weights.
+are read as in views (`splatseg.lift.label_maps`), with :math:`d_i / \sum_j d_j` for blending
+weights.
 
 References:
     Wu et al., OpenGaussian (NeurIPS 2024): points of ScanNet take labels of Gaussians, faint
@@ -16,19 +17,19 @@ References:
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from splatseg._check import check_choice, check_finite, check_range, check_shape
+from splatseg._check import check_finite, check_shape
 from splatseg.core import UNLABELLED, Features, Gaussians, PointLabels
-from splatseg.core.boundary import boundary, convert_fields
+from splatseg.core.boundary import boundary
+from splatseg.core.options import Positive, Share, options
 from splatseg.core.rigid import rotation_from_quaternion
-from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.lift.heads import ClassifierHead
+from splatseg.errors import InputError, ShapeError
+from splatseg.lift.label_maps import ClassifierHead
 from splatseg.neighbours import NeighbourIndex
 
 PointRule = Literal["weighted", "nearest"]
@@ -37,7 +38,11 @@ PointRule = Literal["weighted", "nearest"]
 _POINTS = 16384
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+NEIGHBOURS = 16
+"""Gaussians that vote at a point, the nearest by centre."""
+
+
+@options(removed={"neighbours": "the 16 nearest Gaussians vote at a point"})
 class PointLabelOptions:
     """How points take labels from Gaussians."""
 
@@ -45,26 +50,13 @@ class PointLabelOptions:
     """weighted: by the density there of the Gaussians around it. nearest: that of the nearest
     centre."""
 
-    neighbours: int = 16
-    """Gaussians that vote at a point, the nearest by centre, at least 1."""
-
-    min_opacity: float = 0.1
+    min_opacity: Share = 0.1
     """Fainter Gaussians are not there, in [0, 1]; as in OpenGaussian's protocol on ScanNet."""
 
-    max_mahalanobis: float | None = None
+    max_mahalanobis: Positive | None = None
     """weighted: standard deviations beyond which a Gaussian does not reach a point, which has no
     label where none does. None lets every density count, and the nearest centre where there is
     none."""
-
-    def __post_init__(self) -> None:
-        convert_fields(self)
-        check_choice("rule", self.rule, get_args(PointRule))
-        check_range("min_opacity", self.min_opacity, 0.0, 1.0)
-        if self.neighbours < 1:
-            raise RangeError(f"neighbours: expected at least 1, got {self.neighbours}.")
-        cap = self.max_mahalanobis
-        if cap is not None and not cap > 0:
-            raise RangeError(f"max_mahalanobis: expected a positive number, got {cap}.")
 
 
 @boundary
@@ -189,7 +181,7 @@ def _around(
     there = gaussians[solid.to(gaussians.means.device)].to(device="cpu", dtype=torch.float64)
     index = NeighbourIndex(there)
     nearest = options.rule == "nearest"
-    count = 1 if nearest else min(options.neighbours, len(rows))
+    count = 1 if nearest else min(NEIGHBOURS, len(rows))
     # Rows of whitening matrices: |S^-1 R^T (x - mean)| is the Mahalanobis distance.
     rotations = rotation_from_quaternion(there.rotations)
     scales = there.scales.clamp_min(1e-12)

@@ -37,8 +37,7 @@ from splatseg.core import UNLABELLED, Features
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.lift.relevancy import TextSpace
-from splatseg.lift.vocabulary import Vocabulary
+from splatseg.lift.vocabulary import TextSpace, Vocabulary
 
 TEMPERATURE = 30.0
 """Tau."""

@@ -1,13 +1,15 @@
 """What a method declares of itself; flags, help, documentation and refusals follow from it."""
 
-from collections.abc import Callable, Mapping
+import difflib
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
+from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Literal, cast
 
 from splatseg.core import ClassTable, Features, Gaussians, Layer, View
-from splatseg.core.boundary import convert_fields
+from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.checkpoints import Checkpoints
-from splatseg.errors import InputError
+from splatseg.errors import FileFormatError, InputError, MissingPackageError
 from splatseg.io.evidence import Evidence, EvidenceKind, FeatureEvidence, TrackedEvidence
 
 ANY_COMPANION = "any"
@@ -233,3 +235,153 @@ def _field_names(options: type[Any]) -> list[str]:
         else:
             names.append(each.name)
     return names
+
+
+# Another package brings a method by an entry point of the group ``splatseg.methods``: its name is
+# the method's, its value a `Method`. ``docs/methods.md`` has one of ten lines.
+
+
+ENTRY_POINT_GROUP = "splatseg.methods"
+
+_OWN = {
+    "uplift": "uplift:METHOD", "features": "uplift:FEATURES", "objects": "objects:METHOD",
+    "voxels": "voxels:METHOD", "vote": "vote:METHOD", "associate": "associate:METHOD",
+    "object-classes": "object_classes:METHOD", "identity": "identity:METHOD",
+    "saga": "saga:METHOD", "cosseg": "cosseg:METHOD", "prompt": "prompt:METHOD",
+}  # fmt: skip
+"""Methods of this package, imported when they are asked for, and where they are."""
+
+_ABOVE = {"dnmp": "splatseg.street.method:METHOD"}
+"""The same of packages above this one."""
+
+_REMOVED = dict.fromkeys(
+    ("logits", "probabilities"), "identity with as many channels as there are ids does the same"
+)
+"""Methods that went, whose layers keep the ids of the evidence, and what to use instead."""
+
+_REGISTERED: dict[str, Method] = {}
+
+
+def method_names() -> tuple[str, ...]:
+    """Names that `find_method` knows: ours in the order of the documentation, then others'."""
+    return (*_known(), *_REGISTERED)
+
+
+@boundary
+def find_method(name: str) -> Method:
+    """The method of this name.
+
+    Raises:
+        InputError: If there is none, or what another package brings is no method.
+        MissingPackageError: If the package that brings it, or one it needs, cannot be imported.
+    """
+    if name in _REGISTERED:
+        return _REGISTERED[name]
+    if name in _REMOVED:
+        raise InputError(f"method {name!r} was removed; {_REMOVED[name]}.")
+    known = _known()
+    if name not in known:
+        close = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
+        hint = f"did you mean {' or '.join(close)}?" if close else f"known: {', '.join(known)}."
+        raise InputError(f"there is no method {name!r}; {hint}")
+    entry = known[name]
+    try:
+        found: object = entry.load()
+    except (ImportError, AttributeError) as error:
+        raise MissingPackageError(
+            f"method {name!r} ({entry.value}) cannot be loaded: {error}."
+        ) from error
+    if not isinstance(found, Method):
+        raise InputError(
+            f"method {name!r} ({entry.value}): expected a splatseg.methods.Method, "
+            f"got {type(found).__name__}."
+        )
+    if found.name != name:
+        raise InputError(
+            f"method {name!r} ({entry.value}): expected a method of this name, got {found.name!r}."
+        )
+    return found
+
+
+@boundary
+def register_method(method: Method) -> Method:
+    """Make a method known by its name for as long as this process runs.
+
+    A notebook tries a method so; a package that brings one for good has an entry point. One that
+    was registered before under the name is replaced, which a cell that runs twice does.
+
+    Raises:
+        InputError: If the name is that of a method of ours or of an installed package.
+    """
+    if method.name in _known():
+        raise InputError(f"method: expected a name that is free, got {method.name!r}.")
+    _REGISTERED[method.name] = method
+    return method
+
+
+def methods() -> tuple[Method, ...]:
+    """All methods, in the order of `method_names`."""
+    return tuple(find_method(name) for name in method_names())
+
+
+@boundary
+def keeps_ids(method: object) -> bool:
+    """Whether layers of this method have the ids of the evidence that they were made from.
+
+    Args:
+        method: Its name, as the info of a layer has it; no method keeps no ids.
+    """
+    if not isinstance(method, str):
+        return False
+    return method in _REMOVED or (method in method_names() and find_method(method).keeps_ids)
+
+
+@boundary
+def keeps_boundaries(method: object) -> bool:
+    """Whether layers of this method have their boundaries where the label maps have them.
+
+    Args:
+        method: Its name, as the info of a layer has it; no method keeps none.
+    """
+    return keeps_ids(method) and (method in _REMOVED or not find_method(str(method)).repairs)
+
+
+def _known() -> dict[str, EntryPoint]:
+    places = {name: f"splatseg.methods.{place}" for name, place in _OWN.items()} | _ABOVE
+    own = {
+        name: EntryPoint(name=name, value=value, group=ENTRY_POINT_GROUP)
+        for name, value in places.items()
+    }
+    others = {entry.name: entry for entry in entry_points(group=ENTRY_POINT_GROUP)}
+    # Another package cannot take the place of a method of ours.
+    return own | {name: others[name] for name in sorted(others) if name not in own}
+
+
+BEGIN = "<!-- methods: made by scripts/methods_table -->"
+END = "<!-- end of methods -->"
+
+
+@boundary
+def methods_table(methods: Sequence[Method]) -> str:
+    """A Markdown table, a row a method."""
+    rows = [
+        f"| `{method.name}` | {', '.join(method.evidence)} | {method.returns} | {method.summary} "
+        f"| {method.reference} |"
+        for method in methods
+    ]
+    head = ["| method | evidence | gives | what it does | reference |", "| --- " * 5 + "|"]
+    return "\n".join([*head, *rows])
+
+
+@boundary
+def with_table(text: str, table: str) -> str:
+    """A page with the table between its two marks.
+
+    Raises:
+        FileFormatError: If the marks are not there.
+    """
+    before, mark, rest = text.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not (mark and end):
+        raise FileFormatError(f"expected the marks {BEGIN!r} and {END!r}, got a page without.")
+    return f"{before}{BEGIN}\n{table}\n{END}{after}"

@@ -26,50 +26,71 @@ References:
     and its published code for rates and counts.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, replace
+from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+from torch.nn.functional import embedding
 
 from splatseg.core import ClassTable, Features, Gaussians, Labels, LabelSource, View
+from splatseg.core.options import Count, NonNegative, options
 from splatseg.core.sh import SH_C0
-from splatseg.errors import RangeError
-from splatseg.lift.heads import Blend, ClassifierHead
-from splatseg.lift.training import TrainingProgress
-from splatseg.methods._identity_loss import NeighbourLoss
-from splatseg.methods._label_models import IdentityModel, linear_start
+from splatseg.lift.label_maps import Blend, ClassifierHead
+from splatseg.lift.training import Batch, Parameter, Values
 from splatseg.methods._method import Method
-from splatseg.methods._trained_labels import (
-    LabelData,
+from splatseg.methods._trained import (
+    TINY,
+    LabelCounts,
+    LabelTrainingOptions,
     features_layer,
     hard_labels,
     label_data,
     layer_info,
+    linear_start,
+    logit_loss,
+    probability_loss,
     runner,
     train_labels,
 )
-from splatseg.methods._trained_labels import TrainingContext as TrainingContext
-from splatseg.methods._trained_options import LabelTrainingOptions, check_rate
-from splatseg.render import RenderOptions
+from splatseg.methods._trained import TrainingContext as TrainingContext
+from splatseg.neighbours import NeighbourIndex
 
-# Ye et al. 2024, sections 3.2 and 4.1 and the published code: what `published` is made of.
+# Ye et al. 2024, sections 3.2 and 4.1 and the published code.
 PUBLISHED_CHANNELS = 16
 PUBLISHED_FEATURE_RATE = 2.5e-3
 PUBLISHED_CLASSIFIER_RATE = 5e-4
 PUBLISHED_KL_WEIGHT = 2.0
-PUBLISHED_KL_EVERY = 5
-PUBLISHED_KL_NEIGHBOURS = 5
-PUBLISHED_KL_SAMPLES = 1000
-PUBLISHED_KL_POINTS = 200_000
 PUBLISHED_STEPS = 30_000
 """Each with one whole picture."""
+
+KL_EVERY = 5
+"""Steps from one neighbour term to the next, as published."""
+
+KL_NEIGHBOURS = 5
+"""Neighbours of a Gaussian, itself counted, as published."""
+
+KL_SAMPLES = 1000
+"""Gaussians that are compared with their neighbours in a step, as published."""
+
+KL_POINTS = 200_000
+"""Gaussians that take part in the neighbour term at most, as published."""
 
 _START = 0xF
 """What the generator of first values is seeded with besides the seed."""
 
+_ROWS = 2048
+"""Gaussians classified at a time: their logits stay in the cache."""
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+
+@options(
+    removed=dict.fromkeys(
+        ("kl_every", "kl_neighbours", "kl_samples", "kl_points"), "it is as published"
+    )
+)
 class IdentityOptions(LabelTrainingOptions):
     """How identities are trained."""
 
@@ -77,37 +98,17 @@ class IdentityOptions(LabelTrainingOptions):
     """features: features are rendered and what is seen is classified, as published.
     probabilities: Gaussians are classified and their probabilities rendered."""
 
-    channels: int = PUBLISHED_CHANNELS
+    channels: Count = PUBLISHED_CHANNELS
     """Width of the identity feature."""
 
-    rate: float = 0.1
+    rate: NonNegative = 0.1
     """Adam's rate for features."""
 
-    classifier_rate: float = 0.05
+    classifier_rate: NonNegative = 0.05
     """Adam's rate for the classifier."""
 
-    kl_weight: float = PUBLISHED_KL_WEIGHT
+    kl_weight: NonNegative = PUBLISHED_KL_WEIGHT
     """Lambda, the weight of the neighbour term; 0 is without."""
-
-    kl_every: int = PUBLISHED_KL_EVERY
-    """Steps from one neighbour term to the next."""
-
-    kl_neighbours: int = PUBLISHED_KL_NEIGHBOURS
-    """Neighbours of a Gaussian, itself counted."""
-
-    kl_samples: int = PUBLISHED_KL_SAMPLES
-    """Gaussians that are compared with their neighbours in a step."""
-
-    kl_points: int = PUBLISHED_KL_POINTS
-    """Gaussians that take part in the neighbour term at most."""
-
-    def __post_init__(self) -> None:
-        LabelTrainingOptions.__post_init__(self)
-        for name in ("channels", "kl_every", "kl_neighbours", "kl_samples", "kl_points"):
-            if getattr(self, name) < 1:
-                raise RangeError(f"{name}: expected at least 1, got {getattr(self, name)}.")
-        for name in ("rate", "classifier_rate", "kl_weight"):
-            check_rate(name, getattr(self, name))
 
     @classmethod
     def published(cls, *, steps: int = 2000) -> "IdentityOptions":
@@ -130,6 +131,187 @@ class IdentityOptions(LabelTrainingOptions):
         )
 
 
+class NeighbourLoss:
+    r"""How far Gaussians' ids are from those of their neighbours in space.
+
+    .. math:: \frac{1}{C} \, \mathrm{mean}_{i, j \in N_k(i)}
+              \sum_c q_{ic} (\log q_{ic} - \log q_{jc})
+
+    Args:
+        means: Centres of all Gaussians.
+        rng: Draws `KL_POINTS` of them, if they are more, once and for all.
+    """
+
+    def __init__(self, means: Float[Tensor, "n 3"], rng: np.random.Generator) -> None:
+        kept = np.arange(len(means))
+        if len(means) > KL_POINTS:
+            kept = np.sort(rng.choice(len(means), KL_POINTS, replace=False))
+        self._kept = kept
+        self._index = NeighbourIndex(means[torch.from_numpy(kept)])
+        self._neighbours = min(KL_NEIGHBOURS, len(kept))
+
+    def draw(self, rng: np.random.Generator) -> Int64[Tensor, "samples k"]:
+        """The neighbours of some Gaussians, nearest first: each itself, then the nearest others."""
+        count = min(KL_SAMPLES, len(self._kept))
+        rows = torch.from_numpy(rng.choice(len(self._kept), count, replace=False))
+        near = rows[:, None]
+        if self._neighbours > 1:
+            others = self._index.nearest_others(self._neighbours - 1, rows=rows)
+            near = torch.cat((near, others.indices), dim=1)
+        return torch.from_numpy(self._kept)[near]
+
+    def loss(
+        self,
+        features: Float[Tensor, "m channels"],
+        pairs: Int64[Tensor, "samples k"],
+        weight: Float[Tensor, "classes channels"],
+        bias: Float[Tensor, "classes"],
+    ) -> Float[Tensor, ""]:
+        """The term, for rows `pairs` of `features`: each row's first against all of it."""
+        probabilities = torch.softmax(features @ weight.T + bias, dim=-1)
+        logs = torch.log(probabilities + TINY)
+        own = pairs[:, :1]
+        divergence = (probabilities[own] * (logs[own] - logs[pairs])).sum(dim=-1)
+        return divergence.mean() / len(bias)
+
+
+def linear_own_probability(
+    batch: Batch,
+    label: Int64[Tensor, "pixels"],
+    features: Float[Tensor, "t channels"],
+    weight: Float[Tensor, "classes channels"],
+    bias: Float[Tensor, "classes"],
+) -> Float[Tensor, "pixels"]:
+    r"""The rendered probability of each pixel's own label, without those of all others.
+
+    .. math:: \sum_i w_{pi} \exp(z_{i, c_p} - \log \sum_c e^{z_{ic}})
+
+    of touched Gaussians' features and a linear classifier, differentiable towards all three, needs
+    one logit for each entry of W and one log-sum-exp for each Gaussian. A matrix of all touched
+    Gaussians and all classes is never made.
+    """
+    rows = batch.weights.rows
+    gaussian, own = rows.ids.long(), torch.repeat_interleave(label, rows.indptr.diff())
+    # The gradient of `embedding` is a sum in the order of entries, in one pass.
+    logit = (embedding(gaussian, features) * embedding(own, weight)).sum(dim=1)
+    logit = logit + embedding(own, bias[:, None]).squeeze(1)
+    normaliser = _LinearLogSumExp.apply(features, weight, bias)
+    each = torch.exp(logit - embedding(gaussian, normaliser[:, None]).squeeze(1))
+    # Rows whose entries are columns of their own: sums of each pixel's entries.
+    entries = torch.arange(len(gaussian), dtype=torch.int32)
+    return replace(rows, ids=entries, gaussians=len(entries)).product(each[:, None]).squeeze(1)
+
+
+class _LinearLogSumExp(torch.autograd.Function):
+    r"""``logsumexp(features @ weight.T + bias, dim=1)``, a block of rows at a time.
+
+    With :math:`q = \mathrm{softmax}(A f + b)` and g the gradient towards the result, gradients
+    are :math:`g A^\top q` towards f, and sums of :math:`g q f^\top` and :math:`g q` towards A, b.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, features: Tensor, weight: Tensor, bias: Tensor) -> Tensor:  # type: ignore[override]
+        result = features.new_empty(len(features))
+        for begin in range(0, len(features), _ROWS):
+            block = slice(begin, begin + _ROWS)
+            logits = torch.addmm(bias, features[block], weight.T)
+            result[block] = torch.logsumexp(logits, dim=1)
+        ctx.save_for_backward(features, weight, bias, result)
+        return result
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Any) -> Any:
+        features, weight, bias, result = ctx.saved_tensors
+        gradient = gradients[0]
+        towards = (
+            torch.empty_like(features), torch.zeros_like(weight), torch.zeros_like(bias),
+        )  # fmt: skip
+        for begin in range(0, len(features), _ROWS):
+            block = slice(begin, begin + _ROWS)
+            each = torch.addmm(bias, features[block], weight.T)
+            each.sub_(result[block, None]).exp_().mul_(gradient[block, None])
+            torch.mm(each, weight, out=towards[0][block])
+            towards[1].addmm_(each.T, features[block])
+            towards[2].add_(each.sum(dim=0))
+        return towards
+
+
+class IdentityModel:
+    """Identity features, one linear classifier for all, and the neighbour term.
+
+    Args:
+        means: Centres of the Gaussians.
+        classes: How many ids there are.
+        options: How identities are trained.
+        rng: Draws what features and the classifier start as.
+    """
+
+    def __init__(
+        self,
+        means: Float[Tensor, "n 3"],
+        classes: int,
+        options: IdentityOptions,
+        rng: np.random.Generator,
+    ) -> None:
+        # As published, features start like colours: uniform in [0, 1], as a harmonic.
+        start = (rng.random((len(means), options.channels), dtype=np.float32) - 0.5) / SH_C0
+        weight, bias = linear_start(options.channels, classes, rng)
+        self._options = options
+        self._rows = {"features": Parameter(start=torch.from_numpy(start), rate=options.rate)}
+        self._shared = {
+            "weight": Parameter(start=weight, rate=options.classifier_rate),
+            "bias": Parameter(start=bias, rate=options.classifier_rate),
+        }
+        self._neighbours = NeighbourLoss(means, rng) if options.kl_weight > 0 else None
+
+    @property
+    def row_parameters(self) -> Mapping[str, Parameter]:
+        """``features``."""
+        return self._rows
+
+    @property
+    def shared_parameters(self) -> Mapping[str, Parameter]:
+        """The classifier: ``weight`` and ``bias``."""
+        return self._shared
+
+    def loss(self, batch: Batch, values: Values) -> Float[Tensor, ""]:
+        """The pixel term, and every so often the neighbour term."""
+        weight, bias = values.shared["weight"], values.shared["bias"]
+        features = values.rows("features", batch.weights.touched)
+        label, confidence = batch.target("label"), batch.target("confidence")
+        if self._options.blend == "features":
+            logits = batch.weights.product(features) @ weight.T + bias
+            loss = logit_loss(logits, label, confidence)
+        else:
+            own = linear_own_probability(batch, label, features, weight, bias)
+            alpha = batch.weights.rows.row_sums()
+            loss = probability_loss(own, alpha, confidence, len(bias))
+        if self._neighbours is None or values.step % KL_EVERY:
+            return loss
+        pairs = self._neighbours.draw(values.rng)
+        names, position = torch.unique(pairs, return_inverse=True)
+        term = self._neighbours.loss(values.rows("features", names), position, weight, bias)
+        return loss + self._options.kl_weight * term
+
+    def score(self, batches: Sequence[Batch], values: Values) -> float:
+        """Mean intersection over union of what is rendered with the held-out labels."""
+        weight, bias = values.shared["weight"], values.shared["bias"]
+        counts = LabelCounts(len(bias))
+        for batch in batches:
+            features = values.rows("features", batch.weights.touched)
+            if self._options.blend == "features":
+                rendered = batch.weights.product(features) @ weight.T + bias
+            else:
+                probabilities = torch.softmax(features @ weight.T + bias, dim=-1)
+                rendered = batch.weights.product(probabilities)
+            counts.add(
+                batch.target("label"),
+                rendered.argmax(dim=1),
+                batch.target("confidence") * batch.stands_for,
+            )
+        return counts.mean_iou
+
+
 def identity(
     gaussians: Gaussians,
     views: Sequence[View],
@@ -137,7 +319,6 @@ def identity(
     *,
     options: IdentityOptions | None = None,
     classes: ClassTable | None = None,
-    render_options: RenderOptions | None = None,
     backend: str = "auto",
     progress: Callable[[int, int], None] | None = None,
     seed: int = 0,
@@ -153,7 +334,6 @@ def identity(
         evidence: Their label maps, as large as the photographs or reduced in proportion.
         options: How identities are trained.
         classes: Names of the ids, for the info.
-        render_options: Switches of the blending model.
         backend: Name of the rendering backend.
         progress: Called with the steps done and all there are to do.
         seed: Of the pixels, the first features and the order of batches.
@@ -168,20 +348,9 @@ def identity(
         ShapeError: If a label map does not have its photograph's proportions.
     """
     options = options or IdentityOptions()
-
-    def tell(state: TrainingProgress) -> None:
-        if progress is not None:
-            progress(state.step, state.steps)
-
+    context = TrainingContext(backend=backend, progress=progress, seed=seed)
     features = train_identity(
-        gaussians,
-        views,
-        evidence,
-        options=options,
-        classes=classes,
-        context=TrainingContext(
-            render_options=render_options, backend=backend, progress=tell, seed=seed
-        ),
+        gaussians, views, evidence, options=options, classes=classes, context=context
     )
     return hard_labels(features, options)
 
@@ -203,11 +372,12 @@ def train_identity(
 
     Raises:
         InputError: As `identity`; also if a checkpoint is of another training.
-        KeyboardInterrupt: If it was cancelled.
+        KeyboardInterrupt: If it was interrupted.
     """
     options, context = options or IdentityOptions(), context or TrainingContext()
     data = label_data(gaussians, views, evidence, options=options, context=context)
-    model = _model(gaussians, data, options, context.seed)
+    rng = np.random.default_rng((context.seed, _START))
+    model = IdentityModel(gaussians.means.detach().cpu(), len(data.ids), options, rng)
     result = train_labels("identity", data, model, options=options, context=context)
     head = ClassifierHead(
         ids=data.ids,
@@ -219,35 +389,6 @@ def train_identity(
         "identity", asdict(options), data, result, head=head, classes=classes, seed=context.seed
     )
     return features_layer(result.rows["features"], result, info)
-
-
-def _model(
-    gaussians: Gaussians, data: LabelData, options: IdentityOptions, seed: int
-) -> IdentityModel:
-    rng = np.random.default_rng((seed, _START))
-    # As published, features start like colours: uniform in [0, 1], as a harmonic.
-    start = (rng.random((len(gaussians), options.channels), dtype=np.float32) - 0.5) / SH_C0
-    weight, bias = linear_start(options.channels, len(data.ids), rng)
-    neighbours = None
-    if options.kl_weight > 0:
-        neighbours = NeighbourLoss(
-            gaussians.means.detach().cpu(),
-            neighbours=options.kl_neighbours,
-            points=options.kl_points,
-            rng=rng,
-        )
-    return IdentityModel(
-        torch.from_numpy(start),
-        weight,
-        bias,
-        blend=options.blend,
-        feature_rate=options.rate,
-        classifier_rate=options.classifier_rate,
-        neighbours=neighbours,
-        neighbour_weight=options.kl_weight,
-        neighbour_every=options.kl_every,
-        neighbour_samples=options.kl_samples,
-    )
 
 
 METHOD = Method(

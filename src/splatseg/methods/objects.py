@@ -46,9 +46,9 @@ from splatseg.core.options import options as options_class
 from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError, ShapeError
 from splatseg.lift.label_maps import label_map
-from splatseg.lift.mass.adjoint import voting_views
-from splatseg.lift.mass.features import camera_of_grid, checked_grid
-from splatseg.lift.segments.recorded import EvidenceSegments
+from splatseg.lift.segments import EvidenceSegments
+from splatseg.lift.voting.features import camera_of_grid, checked_grid
+from splatseg.lift.voting.uplift import voting_views
 from splatseg.methods._method import Method, MethodInputs
 from splatseg.methods.associate import associate
 from splatseg.render import RenderOptions

@@ -1,15 +1,22 @@
-"""Uplift as a method: every pixel votes for its label on the Gaussians it shows."""
+"""Uplift as a method: pixels vote for their label, or give their features, to what they show."""
 
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import field, replace
 
-from splatseg.core import Labels
-from splatseg.lift.mass.confusion import ConfusionOptions
-from splatseg.lift.mass.uplift import UpliftOptions
-from splatseg.lift.pipeline import lift_labels
+from splatseg.core import ClassTable, Features, Gaussians, Labels, LabelSource, View
+from splatseg.core.options import options
+from splatseg.lift.voting.confusion import (
+    CANDIDATES,
+    DEFAULT_CONFUSION,
+    ConfusionOptions,
+    correct_confusion,
+)
+from splatseg.lift.voting.features import FeatureUpliftOptions, uplift_features
+from splatseg.lift.voting.uplift import UpliftOptions, uplift
 from splatseg.methods._method import Method, MethodInputs
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@options
 class UpliftMethodOptions:
     """Votes, and what corrects them."""
 
@@ -24,15 +31,64 @@ class UpliftMethodOptions:
     """How the evidence errs."""
 
 
+def lift_labels(
+    gaussians: Gaussians,
+    views: Sequence[View],
+    evidence: LabelSource,
+    *,
+    options: UpliftOptions | None = None,
+    confusion: ConfusionOptions | None = DEFAULT_CONFUSION,
+    classes: ClassTable | None = None,
+    backend: str = "auto",
+    progress: Callable[[int, int], None] | None = None,
+) -> Labels:
+    """Label Gaussians by label maps: the votes of `uplift`, relabelled by `correct_confusion`.
+
+    Args:
+        gaussians: The Gaussians of the scene.
+        views: Those that vote: a method that is to be measured uses train views only.
+        evidence: Their label maps, whose ids mean the same in all views.
+        options: How votes become labels.
+        confusion: How the evidence errs. None takes the ids with most votes, and so do rules
+            other than ``share``.
+        classes: Names of the ids, for the info.
+        backend: Name of the rendering backend.
+        progress: Called with the views done and all there are to do.
+
+    Returns:
+        The layer; soft only if `options` ask for more than one candidate.
+
+    Raises:
+        InputError: If there are no views, if one has no label map, or no pixel has a label.
+        ShapeError: If a label map does not have its photograph's proportions.
+    """
+    options = options or UpliftOptions()
+    relabel = confusion is not None and options.label_rule == "share"
+    hard = options.candidates < 2
+    labels = uplift(
+        gaussians,
+        views,
+        evidence,
+        options=options.with_candidates(CANDIDATES) if relabel and hard else options,
+        classes=classes,
+        backend=backend,
+        progress=progress,
+    )
+    if not relabel:
+        return labels
+    correlation = labels.info.view_correlation
+    labels = correct_confusion(labels, options=confusion, view_correlation=correlation)
+    return replace(labels, candidates=None, shares=None) if hard else labels
+
+
 def run(inputs: MethodInputs, options: UpliftMethodOptions) -> Labels:
-    """Label Gaussians by votes of pixels, see `lift.pipeline.lift_labels`."""
-    confusion = options.confusion if options.correct_confusion else None
+    """Label Gaussians by votes of pixels, see `lift_labels`."""
     return lift_labels(
         inputs.gaussians,
         inputs.views,
         inputs.evidence,
         options=options.votes,
-        confusion=confusion,
+        confusion=options.confusion if options.correct_confusion else None,
         classes=inputs.label_names,
         backend=inputs.backend,
         progress=inputs.progress,
@@ -48,4 +104,27 @@ METHOD = Method(
     run=run,
     keeps_ids=True,
     published=UpliftMethodOptions(correct_confusion=False),
+)
+
+
+def run_features(inputs: MethodInputs, options: FeatureUpliftOptions) -> Features:
+    """Lift feature maps, see `uplift_features`."""
+    return uplift_features(
+        inputs.gaussians,
+        inputs.views,
+        inputs.evidence,
+        options=options,
+        backend=inputs.backend,
+        progress=inputs.progress,
+    )
+
+
+FEATURES = Method(
+    name="features",
+    summary="each Gaussian takes the mean of the features that its pixels show",
+    reference="LUDVIG (Marrie et al. 2024), eq. 4",
+    evidence=("features",),
+    options=FeatureUpliftOptions,
+    run=run_features,
+    returns="features",
 )

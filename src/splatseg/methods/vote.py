@@ -17,19 +17,16 @@ A centre is seen through whatever hides it, unless the occlusion test is asked f
 References:
     Hu et al., Semantic Anything in 3D Gaussians (SA-GS / SAGD, 2024), section 4.3: more than
     0.7 of all views. Prompt SA-GS (2024), eq. 7 and 8: more than 0.6 of them.
-    Yan et al., Street Gaussians (2024), as read into points by the mesh-based street field:
-    regions around centres vote.
 """
 
-import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Literal
 
 import torch
+from jaxtyping import Float, Int64
 from torch import Tensor
 
-from splatseg._check import check_choice, check_range
 from splatseg.core import (
     UNLABELLED,
     Camera,
@@ -42,22 +39,121 @@ from splatseg.core import (
     View,
     camera_of_map,
 )
-from splatseg.errors import InputError, RangeError
-from splatseg.lift.mass.adjoint import voting_views
-from splatseg.lift.mass.centres import Centres, centre_weights, centres_in, majority_map, unoccluded
-from splatseg.lift.mass.vote_table import VoteTable
+from splatseg.core.options import Share, options
+from splatseg.errors import InputError
+from splatseg.lift.voting.uplift import names_of, voting_views
+from splatseg.lift.voting.votes import SLOTS, VoteTable
 from splatseg.methods._method import Method, MethodInputs
 from splatseg.render import PreparedView, RenderOptions, options_for, prepare
+
+_FOLD_TOLERANCE = 1e-2
+"""A point whose pixel straightens to elsewhere, in pixels, lies beyond the fold of the lens."""
+
+_PIXELS = 32768
+"""Rows of W held at a time; bounds memory."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Centres:
+    """The Gaussians whose centres a view has a pixel for."""
+
+    gaussians: Int64[Tensor, "m"]
+    """Which, ascending."""
+
+    pixels: Int64[Tensor, "m 2"]
+    """Column and row of each."""
+
+    depth: Float[Tensor, "m"]
+    """z-depth of each centre, scene units."""
+
+    def __getitem__(self, index: Tensor) -> "Centres":
+        """Some of them."""
+        return Centres(
+            gaussians=self.gaussians[index], pixels=self.pixels[index], depth=self.depth[index]
+        )
+
+
+def centres_in(means: Float[Tensor, "n 3"], camera: Camera, *, near: float) -> Centres:
+    """Project centres into the pixels of any camera, distortion included.
+
+    What lies nearer than `near`, outside the image or beyond the fold of the lens, where the
+    polynomial leads back into the image, is left out.
+    """
+    points = means.detach().cpu().double()
+    projected, depth = camera.project(points)
+    size = projected.new_tensor([camera.width, camera.height])
+    inside = (depth > near) & ((projected >= 0) & (projected < size)).all(dim=-1)
+    rows = torch.nonzero(inside).squeeze(1)
+    if not camera.is_pinhole:
+        pinhole_pixels = replace(camera, model="pinhole", distortion=()).project(points[rows])[0]
+        undistorted = camera.undistort_pixels(projected[rows])
+        rows = rows[
+            torch.linalg.vector_norm(undistorted - pinhole_pixels, dim=-1) < _FOLD_TOLERANCE
+        ]
+    return Centres(gaussians=rows, pixels=projected[rows].floor().long(), depth=depth[rows])
+
+
+def unoccluded(
+    centres: Centres, gaussians: Gaussians, view: PreparedView, *, tolerance: float
+) -> Tensor:
+    """Which centres are not behind the surface that the view shows, bool (m,).
+
+    A pixel's surface is at its median depth (`Rendered.median_depth`), where transmittance falls
+    to one half; a pixel without one occludes nothing.
+    """
+    with torch.no_grad():
+        signal = gaussians.means.new_zeros(len(gaussians), 1)
+        rendered = view.render(signal, warp="nearest")
+    surface = rendered.median_depth.cpu().double()[centres.pixels[:, 1], centres.pixels[:, 0]]
+    return (surface <= 0) | (centres.depth <= surface * (1 + tolerance))
+
+
+def centre_weights(
+    centres: Centres, gaussians: Gaussians, view: PreparedView
+) -> Float[Tensor, "m"]:
+    """Blending weight of each Gaussian at the pixel of its centre, float32."""
+    width = view.camera.width
+    flat = centres.pixels[:, 1] * width + centres.pixels[:, 0]
+    centre_pixels = torch.unique(flat)
+    centre_pixel = torch.full((len(gaussians),), -1, dtype=torch.int64)
+    centre_pixel[centres.gaussians] = flat
+    centre_weight = torch.zeros(len(gaussians))
+    for part in torch.split(centre_pixels, _PIXELS):
+        requested = torch.stack((part % width, part // width), dim=-1)
+        rows = view.weights(requested)
+        ids = rows.ids.cpu().long()
+        pixel = torch.repeat_interleave(part, torch.diff(rows.indptr.cpu()))
+        own = centre_pixel[ids] == pixel
+        centre_weight[ids[own]] = rows.weights.cpu().float()[own]
+    return centre_weight[centres.gaussians]
+
 
 VoteRule = Literal["visible", "published"]
 VoteOcclusion = Literal["none", "depth", "weight"]
 VoteWeight = Literal["one", "transmittance"]
 
 _PUBLISHED_SHARE = 0.7
-_SLOTS = 32
+
+_DEPTH_TOLERANCE = 0.05
+"""How far behind the median depth a centre may lie, as a part of that depth."""
+
+_MIN_WEIGHT = 0.01
+"""Blending weight at the pixel of its centre that a Gaussian needs to be seen."""
+
+_MEMORY = 1 << 30
+"""Bytes of an exact table of votes."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@options(
+    removed={
+        "depth_tolerance": "a centre may lie a twentieth behind the median depth",
+        "min_weight": "a Gaussian is seen where its blending weight is 0.01 or more",
+        "count_void": "label the pixels outside an object with an id of their own",
+        "candidates": "method uplift makes soft layers",
+        "region": "the pixel of the centre decides alone",
+        "memory": "the table of votes is exact up to 1 GiB",
+    }
+)
 class VoteOptions:
     """How views vote."""
 
@@ -65,7 +161,7 @@ class VoteOptions:
     """visible: shares are of the votes of views that see a Gaussian. published: they are of all
     views, as in SA-GS; views that do not see it vote against it."""
 
-    share: float | None = None
+    share: Share | None = None
     """Share in [0, 1] that the winner must exceed. None is 0 for visible and SA-GS's 0.7 for
     published; Prompt SA-GS takes 0.6."""
 
@@ -74,48 +170,9 @@ class VoteOptions:
     where it is not behind the rendered median depth. weight: those where the Gaussian has
     blending weight at that pixel."""
 
-    depth_tolerance: float = 0.05
-    """How far behind the median depth a centre may lie, as a part of that depth."""
-
-    min_weight: float = 0.01
-    """Blending weight in [0, 1] at the pixel of its centre that a Gaussian needs to be seen, for
-    the occlusion test by weight."""
-
     weight: VoteWeight = "one"
     """What a view's vote counts. transmittance: the Gaussian's blending weight at the pixel of
     its centre, its opacity there times the transmittance before it."""
-
-    region: int = 0
-    """Pixels on each side of the centre's pixel that decide with it: the vote is for the
-    commonest id of the square. 0 is the pixel alone."""
-
-    count_void: bool = False
-    """Views that see a centre on an unlabelled pixel count against every id, as they do when
-    published: for masks of single objects, whose outside has no label."""
-
-    candidates: int = 1
-    """Ids kept for each Gaussian. 1 makes a hard layer; with more the layer keeps their shares
-    and is rendered softly."""
-
-    memory: int = 1 << 30
-    """Bytes of an exact table of votes, 4 for each id and Gaussian. With more ids than fit, each
-    Gaussian remembers its strongest 32."""
-
-    def __post_init__(self) -> None:
-        check_choice("rule", self.rule, ("visible", "published"))
-        check_choice("occlusion", self.occlusion, ("none", "depth", "weight"))
-        check_choice("weight", self.weight, ("one", "transmittance"))
-        if self.share is not None:
-            check_range("share", self.share, 0.0, 1.0)
-        check_range("min_weight", self.min_weight, 0.0, 1.0)
-        tolerance = self.depth_tolerance
-        if not (math.isfinite(tolerance) and tolerance >= 0):
-            raise RangeError(f"depth_tolerance: expected 0 or more, got {tolerance}.")
-        if self.region < 0:
-            raise RangeError(f"region: expected 0 or more, got {self.region}.")
-        for name in ("candidates", "memory"):
-            if getattr(self, name) < 1:
-                raise RangeError(f"{name}: expected at least 1, got {getattr(self, name)}.")
 
     @property
     def needed_share(self) -> float:
@@ -132,7 +189,6 @@ def vote(
     *,
     options: VoteOptions | None = None,
     classes: ClassTable | None = None,
-    render_options: RenderOptions | None = None,
     backend: str = "auto",
     progress: Callable[[int, int], None] | None = None,
 ) -> Labels:
@@ -148,7 +204,6 @@ def vote(
         evidence: Their label maps, as large as the photographs or reduced in proportion.
         options: How views vote.
         classes: Names of the ids, for the info.
-        render_options: Switches of the blending model, for occlusion and transmittance.
         backend: Name of the rendering backend.
         progress: Called with the views done and all there are to do.
 
@@ -167,11 +222,11 @@ def vote(
     voter = _CentreVoter(
         gaussians=gaussians,
         options=options,
-        render_options=render_options or options_for(gaussians, backend),
+        render_options=options_for(gaussians, backend),
         backend=backend,
     )
-    table, against, ids = _collected(voter, ordered, evidence, progress)
-    return _decide(table, against, options, views=ordered, names=_names(classes, ids))
+    table, ids = _collected(voter, ordered, evidence, progress)
+    return _decide(table, options, views=ordered, names=names_of(classes, ids))
 
 
 def _collected(
@@ -179,12 +234,10 @@ def _collected(
     ordered: Sequence[View],
     evidence: LabelSource,
     progress: Callable[[int, int], None] | None,
-) -> tuple[VoteTable, Tensor, set[int]]:
-    """Votes for ids, votes of unlabelled pixels (n,), and the ids, of all views."""
+) -> tuple[VoteTable, set[int]]:
+    """Votes for ids, and the ids, of all views."""
     count = len(voter.gaussians)
-    slots = max(_SLOTS, voter.options.candidates)
-    table = VoteTable(count, memory=voter.options.memory, slots=slots)
-    against = torch.zeros(count)
+    table = VoteTable(count, memory=_MEMORY, slots=SLOTS)
     ids: set[int] = set()
     for done, view in enumerate(ordered):
         label_map = evidence.label_map(view.name)
@@ -192,7 +245,6 @@ def _collected(
         votes = voter.view_votes(camera, label_map)
         labelled = votes.ids != UNLABELLED
         table.add_sparse(votes.ids[labelled], votes.gaussians[labelled], votes.weights[labelled])
-        against.index_add_(0, votes.gaussians[~labelled], votes.weights[~labelled])
         ids.update(torch.unique(votes.ids[labelled]).tolist())
         if progress is not None:
             progress(done + 1, len(ordered))
@@ -201,7 +253,7 @@ def _collected(
             f"evidence: expected a labelled pixel at a Gaussian's centre in {len(ordered)} views, "
             "found none."
         )
-    return table, against, ids
+    return table, ids
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -234,7 +286,7 @@ class _CentreVoter:
             vote_weight = weight
         if label_map.confidence is not None:
             vote_weight = vote_weight * label_map.confidence.cpu().float()[row, column]
-        ids = majority_map(label_map.ids.cpu(), self.options.region)
+        ids = label_map.ids.cpu()
         return _ViewVotes(
             gaussians=centres.gaussians, ids=ids[row, column].long(), weights=vote_weight
         )
@@ -243,41 +295,30 @@ class _CentreVoter:
         """The centres that pass the occlusion test, and their weights where they are needed."""
         test = self.options.occlusion
         if test == "depth":
-            visible = unoccluded(
-                centres, self.gaussians, view, tolerance=self.options.depth_tolerance
-            )
+            visible = unoccluded(centres, self.gaussians, view, tolerance=_DEPTH_TOLERANCE)
             centres = centres[visible]
         weight = torch.ones(len(centres.gaussians))
         if test == "weight" or self.options.weight == "transmittance":
             weight = centre_weights(centres, self.gaussians, view)
-            min_weight = self.options.min_weight if test == "weight" else 0.0
+            min_weight = _MIN_WEIGHT if test == "weight" else 0.0
             seen = (weight > 0) & (weight >= min_weight)
             centres, weight = centres[seen], weight[seen]
         return centres, weight
 
 
 def _decide(
-    table: VoteTable,
-    against: Tensor,
-    options: VoteOptions,
-    *,
-    views: Sequence[View],
-    names: dict[int, str],
+    table: VoteTable, options: VoteOptions, *, views: Sequence[View], names: dict[int, str]
 ) -> Labels:
-    ranking = table.rank(options.candidates)
-    total = ranking.total + against if options.count_void else ranking.total
+    ranking = table.rank(1)
+    total = ranking.total
     if options.rule == "published":
         total = torch.full_like(ranking.total, float(len(views)))
-    shares = ranking.votes / torch.where(total > 0, total, 1.0).unsqueeze(1)
     # Sums in float32 may leave a lone id's share a hair above 1.
-    shares = shares.clamp(0, 1)
-    has_label = (ranking.ids[:, 0] != UNLABELLED) & (shares[:, 0] > options.needed_share)
-    soft = options.candidates > 1
+    shares = (ranking.votes[:, 0] / torch.where(total > 0, total, 1.0)).clamp(0, 1)
+    has_label = (ranking.ids[:, 0] != UNLABELLED) & (shares > options.needed_share)
     return Labels(
         ids=torch.where(has_label, ranking.ids[:, 0], UNLABELLED),
-        confidence=torch.where(has_label, shares[:, 0], 0.0),
-        candidates=ranking.ids if soft else None,
-        shares=shares if soft else None,
+        confidence=torch.where(has_label, shares, 0.0),
         evidence=ranking.total,
         info=LayerInfo(
             method="vote",
@@ -286,11 +327,6 @@ def _decide(
             names=names,
         ),
     )
-
-
-def _names(classes: ClassTable | None, ids: set[int]) -> dict[int, str]:
-    known = () if classes is None else classes.rows
-    return {row.id: row.name for row in known if row.id in ids}
 
 
 def run(inputs: MethodInputs, options: VoteOptions) -> Labels:

@@ -1,7 +1,7 @@
 r"""What neighbours say of a selection: specks, holes, hidden Gaussians, and its border.
 
 The neighbour graph of a scene says which Gaussians are neighbours, how alike they are
-(`lift.completion.graph`: distance, colour, normal), and whether they touch. For 400 k Gaussians
+(`lift.neighbour_graph`: distance, colour, normal), and whether they touch. For 400 k Gaussians
 that takes seconds to find and milliseconds to look up, so a session keeps one.
 
 A *hole* is a connected piece of Gaussians that are not selected and around which nearly all are;
@@ -12,7 +12,7 @@ scene.
 
 A *hidden* Gaussian is one that no view explains: it lies inside or behind things. Its membership
 is the share of random walks over the neighbour graph that first meet evidence inside, among those
-that meet any, as in `lift.completion.complete`,
+that meet any, as in `lift.completion`,
 
 .. math:: (a_i, b_i) \leftarrow \sum_j P_{ij} (a_j, b_j), \qquad P = D^{-1} W, \qquad
           p_i = \frac{a_i}{a_i + b_i}
@@ -47,7 +47,7 @@ from splatseg._check import check_shape, check_values
 from splatseg.core import Gaussians, Selection
 from splatseg.core.boundary import boundary
 from splatseg.core.options import Count
-from splatseg.lift.completion.graph import (
+from splatseg.lift.neighbour_graph import (
     NodeAttributes,
     flat_normals,
     neighbour_graph,

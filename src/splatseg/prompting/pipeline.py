@@ -34,7 +34,7 @@ from torch import Tensor
 from splatseg._check import check_values
 from splatseg.core import Gaussians, LabelMap, Selection, View
 from splatseg.errors import InputError, ShapeError
-from splatseg.lift.mass.segment_masses import view_masses
+from splatseg.lift.voting.segment_masses import view_masses
 from splatseg.neighbours import NeighbourIndex, Subset
 from splatseg.prompting import next_click as _clicks
 from splatseg.prompting.graph import (

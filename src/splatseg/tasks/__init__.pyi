@@ -1,9 +1,6 @@
 from .attach import AttachedLayers as AttachedLayers
 from .attach import AttachLayersOptions as AttachLayersOptions
 from .attach import attach_layers as attach_layers
-from .benchmark import BenchOptions as BenchOptions
-from .benchmark import bench as bench
-from .checkpoint_options import CheckpointOptions as CheckpointOptions
 from .checkpoints import CheckpointOptions as CheckpointOptions
 from .demo import Demo as Demo
 from .demo import DemoOptions as DemoOptions

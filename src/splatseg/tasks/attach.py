@@ -27,7 +27,11 @@ from splatseg.io.export import check_parent, column_table_of, label_columns, wri
 from splatseg.io.scene import load_scene, save_scene, save_scene_layer, scene_layer_names
 from splatseg.io.scene_folder import is_scene, work_on_scene
 from splatseg.io.splats import Values, read_scene_splats
-from splatseg.lift import Attached, AttachOptions, attach
+from splatseg.lift import (
+    GaussianMatches,
+    MatchOptions,
+    match_gaussians,
+)
 from splatseg.tasks.export_labels import label_tables
 from splatseg.tasks.import_scene import read_with_notes
 from splatseg.tasks.work import SILENT, Observer, Work, versions
@@ -83,7 +87,7 @@ class AttachedLayers:
     table: Path | None
     """What the ids of a PLY file mean; None for a scene folder."""
 
-    attached: Attached
+    attached: GaussianMatches
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -93,7 +97,7 @@ class _Attaching:
     source: Path
     file: Path
     options: AttachLayersOptions
-    search: AttachOptions | None
+    search: MatchOptions | None
     observer: Observer
 
 
@@ -104,7 +108,7 @@ def attach_layers(
     output: Path | None = None,
     *,
     options: AttachLayersOptions | None = None,
-    attach_options: AttachOptions | None = None,
+    attach_options: MatchOptions | None = None,
     observer: Observer = SILENT,
 ) -> AttachedLayers:
     """Put labels back on Gaussians that an editor reordered, cropped, moved or rounded.
@@ -205,10 +209,12 @@ def _layers_to_file(work: _Attaching, output: Path) -> AttachedLayers:
     table: dict[str, Any] = {}
     if classes is not None and options.layer is not None:
         columns |= label_columns(classes)
-        table |= label_tables(found.carry(classes), "class", options.layer, scene.classes)
+        table |= label_tables(found.transfer(classes), "class", options.layer, scene.classes)
     if instances is not None and options.instances is not None:
         columns |= label_columns(instances, "instance")
-        table |= label_tables(found.carry(instances), "instance", options.instances, scene.classes)
+        table |= label_tables(
+            found.transfer(instances), "instance", options.instances, scene.classes
+        )
     return _write(work, output, _like(scene.gaussians, edited), found, columns=columns, table=table)
 
 
@@ -216,7 +222,7 @@ def _write(
     work: _Attaching,
     output: Path,
     edited: Gaussians,
-    found: Attached,
+    found: GaussianMatches,
     *,
     columns: Mapping[str, Tensor],
     table: Mapping[str, Any],
@@ -224,7 +230,7 @@ def _write(
     """The edited Gaussians as a PLY with columns of the source."""
     content = {"gaussians": len(edited), "columns": table, "attached": _facts(work, found)}
     beside = write_labelled_splats(
-        edited, output, columns=found.carry_columns(columns), table=content
+        edited, output, columns=found.transfer_columns(columns), table=content
     )
     return AttachedLayers(
         output=output, gaussians=len(edited), names=tuple(columns), table=beside, attached=found
@@ -239,7 +245,7 @@ def _layers_to_new_scene(work: _Attaching, output: Path) -> AttachedLayers:
     gone = {
         name: column for name, column in scene.gaussians.extra.items() if name not in edited.extra
     }
-    extra = dict(edited.extra) | found.carry_columns(gone)
+    extra = dict(edited.extra) | found.transfer_columns(gone)
     new = replace(
         _moved(scene, found, work.observer),
         gaussians=_like(scene.gaussians, edited).replace(extra=extra),
@@ -297,8 +303,8 @@ def _edited(work: _Attaching) -> Gaussians:
     return edited
 
 
-def _attached(work: _Attaching, source: Gaussians, edited: Gaussians) -> Attached:
-    found = attach(source, edited, options=work.search)
+def _attached(work: _Attaching, source: Gaussians, edited: Gaussians) -> GaussianMatches:
+    found = match_gaussians(source, edited, options=work.search)
     facts = found.report
     if found.share < work.options.min_found:
         raise InputError(
@@ -326,12 +332,12 @@ def _sentence(move: Mapping[str, Any]) -> str:
     )
 
 
-def _facts(work: _Attaching, found: Attached) -> dict[str, Any]:
+def _facts(work: _Attaching, found: GaussianMatches) -> dict[str, Any]:
     return {"file": work.file.name, "source": work.source.name, **found.report}
 
 
-def _carried(work: _Attaching, found: Attached, layer: Layer) -> Layer:
-    carried = found.carry(layer)
+def _carried(work: _Attaching, found: GaussianMatches, layer: Layer) -> Layer:
+    carried = found.transfer(layer)
     return with_info(carried, carried.info.with_edit("attach", _facts(work, found)))
 
 
@@ -340,7 +346,7 @@ def _like(source: Gaussians, edited: Gaussians) -> Gaussians:
     return edited.replace(antialiased=source.antialiased, low_pass=source.low_pass)
 
 
-def _moved(scene: Scene, found: Attached, observer: Observer) -> Scene:
+def _moved(scene: Scene, found: GaussianMatches, observer: Observer) -> Scene:
     """The scene's views, up axis and units where most of its Gaussians are now."""
     first = found.moves[0]
     if first.stayed:

@@ -290,7 +290,7 @@ def _split_sentence(operation: Operation, split: int, measured: Mapping[str, flo
 def _growth_sentence(added: int, before: int) -> str:
     return (
         f"splitting added {added} Gaussians, {added / before:.0%} of the scene; --cut off splits "
-        "none, --rounds 1 or a larger --min-pixels fewer"
+        "none, a larger --min-pixels fewer"
     )
 
 

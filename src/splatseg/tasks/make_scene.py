@@ -58,67 +58,6 @@ from splatseg.tasks.work import (
 )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MakeSceneOptions(CheckpointOptions):
-    """What is around a fit: how photographs are read, and how it is kept and goes on."""
-
-    format: str = "auto"
-    """How the capture is read: auto, or one of `io.captures.FORMATS`."""
-
-    strict: bool = False
-    """Refuse a capture that lists a photograph which would be left out; see `read_capture`."""
-
-    poses: Poses = "auto"
-    """Where cameras come from: given, the capture; sfm, from the photographs alone; pointmaps,
-    from pointmaps of pairs of them; auto, sfm where the capture has none."""
-
-    pointmaps: str | None = None
-    """Whose pointmaps, with poses pointmaps: a folder of recorded ones, or the name of a model;
-    None is the folder ``pointmaps`` in that of the photographs."""
-
-    frames: int = 120
-    """Frames to take from a video."""
-
-    keep_checkpoint: bool = False
-    """Keep the checkpoint of the finished fit, so that it can be made longer."""
-
-    preset: str = "default"
-    """Name of the preset that the fit's options came from; it is recorded."""
-
-    depth_evidence: str | None = None
-    """Evidence of depth to learn from instead of the capture's own depth maps, with the depth
-    option of the fit: a folder, or its name in the capture or in the scene that is replaced."""
-
-    scans: Path | None = None
-    """Scans of lasers, in any layout that `splatseg.io.scans.read_scans` reads and in the world of
-    the capture: their points are where the fit starts, and the depth that it learns with the
-    metric depth option. None uses none."""
-
-    points: Path | None = None
-    """A PLY file of points, or of a mesh, in the world of the capture: where the fit starts,
-    instead of the capture's own points."""
-
-    moving: Path | None = None
-    """Boxes of moving things, which are left out of training views and of scans: a JSON file, a
-    drive of KITTI-360 or a segment of Waymo."""
-
-    moving_classes: tuple[str, ...] = ()
-    """Classes of label maps whose things move, such as car pedestrian: they are left out of
-    training views."""
-
-    moving_evidence: str | None = None
-    """The label maps of `moving_classes`: a folder, or its name in the capture or in the scene that
-    is replaced. None takes the only label maps there are."""
-
-    moving_clock: MovingClock = "recorded"
-    """What the times of boxes are. recorded: what the data set has, such as seconds. frames: the
-    last number in the name of a view or scan."""
-
-    def __post_init__(self) -> None:
-        convert_fields(self)
-        CheckpointOptions.__post_init__(self)
-        if self.frames < 1:
-            raise InputError(f"frames: expected at least 1, got {self.frames}.")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

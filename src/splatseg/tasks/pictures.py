@@ -23,7 +23,7 @@ from splatseg.io.images import save_png
 from splatseg.io.scene_folder import scene_path
 from splatseg.io.splats import write_splats
 from splatseg.lift import GaussianField
-from splatseg.lift.field_layers import selection_labels
+from splatseg.lift.field import selection_labels
 from splatseg.lift.label_maps import view_label_map
 from splatseg.prompting.prompts import Lasso, SelectionPrompt, ViewPrompt
 from splatseg.render import BackendName, PreparedView, prepare

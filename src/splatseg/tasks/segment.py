@@ -27,8 +27,8 @@ from splatseg.io.evidence import (
     Evidence,
 )
 from splatseg.io.scene import check_name, save_scene_layer
-from splatseg.lift.completion.complete import CompletionOptions, complete
-from splatseg.lift.segments.panoptic import merge_panoptic
+from splatseg.lift.completion import CompletionOptions, complete
+from splatseg.lift.panoptic import merge_panoptic
 from splatseg.methods import Method, MethodInputs, Refined, find_method
 from splatseg.render import BackendName
 from splatseg.tasks.checkpoints import (

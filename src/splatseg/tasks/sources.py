@@ -23,7 +23,6 @@ from splatseg.errors import InputError, quoted
 from splatseg.io.evidence import TEXT_FILE, FeatureEvidence, evidence_header
 from splatseg.io.scene import scene_layer_names
 from splatseg.lift.vocabulary import Vocabulary, vocabulary_of
-from splatseg.lift.words import AnswerOptions
 from splatseg.methods import find_method
 from splatseg.methods.saga import trained_as_published
 from splatseg.methods.voxels.words import LastLayers
@@ -152,9 +151,6 @@ class QueryOptions:
     phrases: Literal["parts", "whole"] = "parts"
     """How a phrase such as "red mug on the desk" is compared with objects. parts: its name, colour,
     and what it stands on or near count beside its cosine. whole: the cosine alone."""
-
-    answers: AnswerOptions = field(default_factory=AnswerOptions)
-    """How cosines become probabilities."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -18,13 +18,13 @@ from splatseg.io.digests import camera_numbers, digest, file_mark
 from splatseg.io.evidence import DepthEvidence, LabelEvidence
 from splatseg.io.scene import (
     DRIVE_FILE,
+    FOLDER,
     new_field_folder,
     remove_field_file,
     remove_field_folder,
     scene_field_names,
     scene_field_path,
 )
-from splatseg.io.scene import FOLDER
 from splatseg.io.scene_folder import work_on_scene
 from splatseg.io.tables import class_rows
 from splatseg.street.block_field import DriveField, DriveScans, block_views

@@ -19,13 +19,18 @@ from splatseg.io.scene import load_scene, new_field_file, remove_field_folder, s
 from splatseg.io.scene_folder import is_scene, scene_lock
 from splatseg.render import BackendName
 from splatseg.report.street_report import DepthError
-from splatseg.street.build import DnmpOptions, MeshFieldFit, MeshFieldInputs, build_mesh_field
+from splatseg.street.build import (
+    PUBLISHED,
+    DnmpOptions,
+    MeshFieldFit,
+    MeshFieldInputs,
+    build_mesh_field,
+)
 from splatseg.street.depth_views import distances_of
 from splatseg.street.field import MeshField
 from splatseg.street.files import save_mesh_field
 from splatseg.street.geometry import DepthView
 from splatseg.street.hits import PrimitiveCaster
-from splatseg.street.build import PUBLISHED
 from splatseg.street.primitives import PrimitiveMesh
 from splatseg.tasks.moving import LeftOut
 from splatseg.tasks.street_inputs import (

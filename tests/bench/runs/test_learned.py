@@ -15,7 +15,7 @@ from splatseg.core import (
     with_info,
 )
 from splatseg.lift.affinity import AffinityHead
-from splatseg.lift.heads import ClassifierHead
+from splatseg.lift.label_maps import ClassifierHead
 from splatseg_bench.measures import LearnedBytes, learned_bytes
 
 COUNT = 5

@@ -16,7 +16,7 @@ from splatseg.cli import main
 from splatseg.errors import InputError
 from splatseg.io.evidence import FeatureEvidence
 from splatseg.io.scene import load_scene
-from splatseg.methods import Method, _registry, identity, register_method, uplift
+from splatseg.methods import Method, _method, identity, register_method, uplift
 from splatseg.methods.identity import IdentityOptions
 from splatseg.methods.uplift import UpliftMethodOptions
 from splatseg_bench.layouts import read_benchmark
@@ -208,7 +208,7 @@ def test_any_registered_method_that_takes_labels(run_room) -> None:
             run_room("cosseg-replica-panoptic", methods=("other",))
     finally:
         for name in ("stranger", "other"):
-            _registry._REGISTERED.pop(name, None)
+            _method._REGISTERED.pop(name, None)
 
 
 def test_classes_by_words(run_room, walk) -> None:
@@ -273,7 +273,7 @@ def test_features_besides_the_evidence(run_room, walk, tmp_path) -> None:
         ):
             run_room(protocol, companions=(str(folder),))
     finally:
-        del _registry._REGISTERED["guided"]
+        del _method._REGISTERED["guided"]
 
 
 def test_companions_of_the_command_reach_the_run(walk, tmp_path, capsys) -> None:

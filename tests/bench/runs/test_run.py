@@ -23,7 +23,7 @@ from splatseg.core.models import TextMasks
 from splatseg.errors import InputError, MissingFileError, RangeError
 from splatseg.io.evidence import create_evidence, save_masks
 from splatseg.io.scene import load_scene, save_scene
-from splatseg.methods import Method, MethodInputs, _registry, find_method, register_method
+from splatseg.methods import Method, MethodInputs, _method, find_method, register_method
 from splatseg.methods.uplift import UpliftMethodOptions
 from splatseg.tasks import SILENT, Observer
 from splatseg_bench.evidence import bench_model, companion_for, seen_for
@@ -126,7 +126,7 @@ def test_any_registered_method_is_run(run) -> None:
     try:
         found = run(methods=("stranger", "uplift"))
     finally:
-        del _registry._REGISTERED["stranger"]
+        del _method._REGISTERED["stranger"]
     assert [one.method for one in found.methods] == ["stranger", "uplift"]
     assert found.methods[0].scores["iou"] > 0.9
 
@@ -407,16 +407,16 @@ def test_words_are_asked_of_published_voxels_by_cosines() -> None:
 def test_options_of_methods_are_another_experiment(run) -> None:
     """Also those that their options hold in an object of their own."""
     assert run().kept == 0
-    done = run(method_options=("correct_confusion=no", "correlated_views=7"))
+    done = run(method_options=("correct_confusion=no", "max_correlation=0.7"))
     assert done.kept == 0
     made = done.methods[0].scenes[0].made["options"]
     assert made["correct_confusion"] is False
-    assert made["confusion"]["correlated_views"] == 7
+    assert made["confusion"]["max_correlation"] == 0.7
     for wrong in ("view_share=0.5", "correct_confusion", "=1"):
         with pytest.raises(InputError, match="^option: expected NAME=VALUE with an option of up"):
             run(method_options=(wrong,))
-    with pytest.raises(InputError, match="option: correlated_views: expected a number, got 'much'"):
-        run(method_options=("correlated_views=much",))
+    with pytest.raises(InputError, match="option: max_correlation: expected a number, got 'much'"):
+        run(method_options=("max_correlation=much",))
 
 
 def test_from_the_command(tiny, tmp_path, capsys) -> None:

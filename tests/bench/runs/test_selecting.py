@@ -26,7 +26,7 @@ from splatseg.io.evidence import create_evidence, save_masks
 from splatseg.io.scene import load_scene
 from splatseg.lift import GaussianField
 from splatseg.lift.affinity import AffinityHead
-from splatseg.methods import Method, MethodInputs, _registry, register_method
+from splatseg.methods import Method, MethodInputs, _method, register_method
 from splatseg.methods.uplift import UpliftMethodOptions
 from splatseg.tasks.sources import OpenedSource, open_source
 from splatseg_bench.answers import BySelection, stroke_prompt
@@ -114,7 +114,7 @@ def run(tiny: tuple[Path, Path], tmp_path: Path) -> Iterator[Callable[..., Bench
         )
     )  # fmt: skip
     yield go
-    del _registry._REGISTERED["stranger"]
+    del _method._REGISTERED["stranger"]
 
 
 def masks(folder: Path) -> Path:

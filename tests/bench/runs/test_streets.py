@@ -17,7 +17,7 @@ from splatseg.errors import InputError, RangeError
 from splatseg.evaluate import Confusion, semantic_score
 from splatseg.io.scene import load_scene, save_scene
 from splatseg.methods import Method, register_method, uplift
-from splatseg.methods import _registry as registry
+from splatseg.methods import _method as registry
 from splatseg.tasks.work import scene_field
 from splatseg_bench.layouts import read_benchmark
 from splatseg_bench.options import BenchOptions

@@ -9,8 +9,8 @@ import torch
 from splatseg.core import Features, LabelMap, View
 from splatseg.core.checkpoints import Checkpoints
 from splatseg.errors import InputError, ShapeError
-from splatseg.lift.heads import ClassifierHead
-from splatseg.methods._trained_labels import TrainingContext
+from splatseg.lift.label_maps import ClassifierHead
+from splatseg.methods._trained import TrainingContext
 from splatseg.methods.cosseg import CossegOptions, train_cosseg
 from splatseg.methods.cosseg.features import ReducedBlocks
 from splatseg.methods.cosseg.options import COMPONENTS, HEAD

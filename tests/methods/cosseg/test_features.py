@@ -121,7 +121,7 @@ def lifted(halves, pixels=None):
 
 @pytest.mark.parametrize("division", ["mean", "pixels"])
 def test_against_the_matrix(halves, division) -> None:
-    from splatseg.lift.mass.features import read_grid
+    from splatseg.lift.voting.features import read_grid
 
     rows = dense(halves)
     count = np.sum([(one > 0).sum(axis=0) for one in rows], axis=0)

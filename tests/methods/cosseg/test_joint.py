@@ -10,7 +10,7 @@ from PIL import Image
 
 from splatseg.core import LabelMap
 from splatseg.errors import InputError
-from splatseg.methods._label_models import linear_start
+from splatseg.methods._trained import linear_start
 from splatseg.methods.cosseg.decoder import FusionShape, decode_all
 from splatseg.methods.cosseg.features import distilled_features
 from splatseg.methods.cosseg.joint import LabelLoss, train_jointly

@@ -13,10 +13,10 @@ from splatseg.core.checkpoints import Checkpoints
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.io.layers import load_layer, save_layer
 from splatseg.lift.affinity import AffinityHead
-from splatseg.lift.heads import ClassifierHead
+from splatseg.lift.label_maps import ClassifierHead
 from splatseg.lift.training import RowSampler
 from splatseg.methods import MethodInputs, find_method
-from splatseg.methods._trained_labels import TrainingContext, loss_curve
+from splatseg.methods._trained import TrainingContext, loss_curve
 from splatseg.methods.saga import SagaOptions, train_saga, trained_as_published
 from splatseg.methods.saga.options import CHANNELS, PUBLISHED_RATE
 from splatseg.methods.saga.train import SagaTargets

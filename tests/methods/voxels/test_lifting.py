@@ -14,8 +14,8 @@ from splatseg.core import UNLABELLED, FeatureMap, Labels, View
 from splatseg.core.sh import base_colours
 from splatseg.errors import InputError, ShapeError
 from splatseg.lift import label_map
-from splatseg.lift.completion.graph import NodeAttributes, neighbour_graph
-from splatseg.lift.mass.features import uplift_features
+from splatseg.lift.neighbour_graph import NodeAttributes, neighbour_graph
+from splatseg.lift.voting.features import uplift_features
 from splatseg.methods.voxels.grid import nearest_voxels, surface_gaussians, voxelise
 from splatseg.methods.voxels.lifting import conjugate_gradients, lift_to_voxels
 

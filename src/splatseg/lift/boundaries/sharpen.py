@@ -34,66 +34,60 @@ import math
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Int32, Int64
+from msgspec import Meta
 from torch import Tensor
 
-from splatseg._check import check_range
 from splatseg.core import UNLABELLED, Gaussians, LabelMap, Labels, LabelSource, View, camera_of_map
-from splatseg.core.boundary import boundary, convert_fields
-from splatseg.errors import InputError, RangeError
+from splatseg.core.boundary import boundary
+from splatseg.core.options import Natural, NonNegative, options
+from splatseg.errors import InputError
 from splatseg.fit import Exposure, FitOptions, Refinement
 from splatseg.lift.label_maps import label_map
-from splatseg.lift.mass.adjoint import voting_views
-from splatseg.lift.mass.confusion import DEFAULT_CONFUSION, ConfusionOptions, correct_confusion
-from splatseg.lift.mass.uplift import UpliftOptions, uplift
+from splatseg.lift.voting.confusion import (
+    CANDIDATES,
+    DEFAULT_CONFUSION,
+    ConfusionOptions,
+    correct_confusion,
+)
+from splatseg.lift.voting.uplift import UpliftOptions, uplift, voting_views
 from splatseg.render import render
 
-_CANDIDATES = 8
-"""Ids of a Gaussian that relabelling chooses from."""
+DECIDE_EVERY = 200
+"""Steps after which labels are decided again."""
+
+_CODES = 4
+"""K: channels of the random codes. More is less noise for more time."""
+
+_RATES_FROM = 0.6
+"""Progress of a fit whose learning rates the first step has; the last has those of a fit's end."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@options(
+    removed={
+        "decide_every": "labels are decided again every 200 steps",
+        "codes": "four channels of codes are rendered",
+        "rates_from": "learning rates begin as they are at 0.6 of a fit",
+    }
+)
 class SharpenOptions:
     """How labels sharpen the geometry."""
 
-    sharpen_steps: int = 400
+    sharpen_steps: Natural = 400
     """Steps, each from one photograph and its label map; 0 leaves the Gaussians as they are."""
 
-    label_weight: float = 0.1
+    label_weight: NonNegative = 0.1
     """Lambda: weight of the label maps beside the photographs. 1 is cleanest, and costs most
     image quality."""
 
-    decide_every: int = 200
-    """Steps after which labels are decided again."""
-
-    trust_pixels: int = 2
-    """Pixels of the label maps count if the layer, as it was, shows their id at most so many
-    pixels away along each axis: they move a boundary, and what contradicts all other views does not
-    count. -1 lets all count."""
-
-    codes: int = 4
-    """K: channels of the random codes. More is less noise for more time."""
-
-    rates_from: float = 0.6
-    """Progress, in [0, 1], of a fit whose learning rates the first step has; the last has those
-    of a fit's end."""
-
-    def __post_init__(self) -> None:
-        convert_fields(self)
-        if self.sharpen_steps < 0:
-            raise RangeError(f"sharpen_steps: expected 0 or more, got {self.sharpen_steps}.")
-        if not (math.isfinite(self.label_weight) and self.label_weight >= 0):
-            raise RangeError(f"label_weight: expected 0 or more, got {self.label_weight}.")
-        if self.decide_every < 1:
-            raise RangeError(f"decide_every: expected at least 1, got {self.decide_every}.")
-        if self.trust_pixels < -1:
-            raise RangeError(f"trust_pixels: expected -1 or more, got {self.trust_pixels}.")
-        if not 1 <= self.codes <= 64:
-            raise RangeError(f"codes: expected 1 to 64, got {self.codes}.")
-        check_range("rates_from", self.rates_from, 0.0, 1.0)
+    trust_pixels: Annotated[int, Meta(ge=-1)] = 2
+    """Distance in pixels, along each axis, within which the layer, as it was, must show the id of
+    a pixel of the label maps for that pixel to count: it moves a boundary, and does not contradict
+    all other views. -1 lets all pixels count."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -159,7 +153,9 @@ def sharpen(
     update = _LabelUpdate(
         views=_photographed(views, evidence),
         label_maps=_CachedLabelMaps(evidence),
-        votes=_with_candidates(uplift_options or UpliftOptions(), confusion),
+        votes=(uplift_options or UpliftOptions()).with_candidates(
+            2 if confusion is None else CANDIDATES
+        ),
         confusion=confusion,
         backend=backend,
     )
@@ -193,7 +189,7 @@ def _refined(
         gaussians,
         update.views,
         steps=options.sharpen_steps,
-        start=options.rates_from,
+        start=_RATES_FROM,
         options=fit,
         exposures=exposures,
         backend=update.backend,
@@ -203,7 +199,7 @@ def _refined(
         loss = _LabelLoss(trusted, labels.ids.cpu(), options, generator, update.backend)
         refinement.step(loss)
         last = done + 1 == options.sharpen_steps
-        if last or (done + 1) % options.decide_every == 0:
+        if last or (done + 1) % DECIDE_EVERY == 0:
             gaussians = refinement.gaussians()
             labels, after = update.labels(gaussians)
         if progress is not None:
@@ -216,12 +212,6 @@ def _refined(
         agreement=(before, after),
         exposures=refinement.exposures,
     )
-
-
-def _with_candidates(options: UpliftOptions, confusion: ConfusionOptions | None) -> UpliftOptions:
-    """The same votes for a soft layer, with the candidates that relabelling needs."""
-    candidates = max(options.candidates, 2 if confusion is None else _CANDIDATES)
-    return replace(options, candidates=candidates, slots=max(options.slots, candidates))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -354,7 +344,7 @@ class _LabelLoss:
         own = self.labels[rows.cpu()]
         known = self.label_maps.ids | {UNLABELLED, *torch.unique(own).tolist()}
         ids = torch.tensor(sorted(known), dtype=torch.int32)
-        codes = 2.0 * torch.randint(0, 2, (len(ids), self.options.codes), generator=self.generator)
+        codes = 2.0 * torch.randint(0, 2, (len(ids), _CODES), generator=self.generator)
         codes -= 1
         # What has no label agrees with nothing.
         codes[ids == UNLABELLED] = 0
@@ -369,6 +359,6 @@ class _LabelLoss:
         if view_map.confidence is not None:
             weight = weight * view_map.confidence
         wanted = codes[torch.searchsorted(ids, view_map.ids)] * weight.unsqueeze(-1)
-        agreement = (rendered * wanted.to(rendered)).sum() / self.options.codes
+        agreement = (rendered * wanted.to(rendered)).sum() / _CODES
         total_weight = float(weight.sum())
         return self.options.label_weight * (1 - agreement / max(total_weight, 1.0))

@@ -1,11 +1,9 @@
-"""Draws pixels of views and keeps their rows of W, cut into batches."""
+"""Which pixels of a view are drawn, and how many each of them stands for."""
 
 import hashlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import get_args
 
 import numpy as np
 import torch
@@ -13,20 +11,20 @@ from jaxtyping import Float, Int64
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splatseg._check import check_choice, check_range
+from splatseg._check import check_range
 from splatseg.core import Camera, Gaussians, View, camera_of_map
-from splatseg.core.boundary import boundary, convert_fields
-from splatseg.errors import InputError, RangeError
-from splatseg.lift.mass.adjoint import voting_views
-from splatseg.lift.training._batches import BatchGroup, batch_groups
-from splatseg.lift.training._pixels import (
-    Sampling,
-    draw_by_group,
-    draw_by_strata,
-    draw_uniformly,
+from splatseg.core.boundary import boundary
+from splatseg.errors import InputError
+from splatseg.lift.training._options import SamplingOptions
+from splatseg.lift.training._targets import (
+    DrawnView,
+    Ragged,
+    RowStore,
+    Target,
+    Targets,
+    TargetSource,
 )
-from splatseg.lift.training._store import DrawnView, RowStore
-from splatseg.lift.training._targets import Ragged, Target, Targets, TargetSource
+from splatseg.lift.voting.uplift import voting_views
 from splatseg.render import (
     CompactRows,
     RenderOptions,
@@ -36,46 +34,155 @@ from splatseg.render import (
     weights,
 )
 
+_GOLDEN = (5**0.5 - 1) / 2
+
+
+def draw_uniformly(
+    pixels: Int64[Tensor, "m"], count: int, rng: np.random.Generator
+) -> tuple[Int64[Tensor, "p"], Float[Tensor, "p"]]:
+    """Some pixels in random order, and how many each stands for: m / p.
+
+    Every pixel is as likely as every other.
+    """
+    total = len(pixels)
+    taken = min(count, total)
+    drawn = rng.choice(total, taken, replace=False, shuffle=True)
+    return pixels[torch.from_numpy(drawn)], torch.full((taken,), total / max(taken, 1))
+
+
+def draw_by_strata(
+    pixels: Int64[Tensor, "m"], width: int, count: int, rng: np.random.Generator
+) -> tuple[Int64[Tensor, "p"], Float[Tensor, "p"]]:
+    r"""One pixel of each of p parts of the picture that hold equally many pixels, give or take one.
+
+    Parts are runs of the pixels in Morton order (bits of row and column in turn), so each is a
+    patch or a few that touch. They come in the order of the fractions of :math:`u + i \phi`, with
+    :math:`\phi` the golden ratio: any so many pixels one after the other lie evenly over the
+    picture, too, and are a stratified draw by themselves.
+
+    Args:
+        pixels: Those that may be drawn, numbered row by row.
+        width: Of the picture.
+        count: How many at most.
+        rng: Draws them.
+    """
+    total = len(pixels)
+    taken = min(count, total)
+    if not taken:
+        return pixels, torch.zeros(0)
+    flat = pixels.numpy()
+    ordered = flat[np.argsort(_morton(flat // width, flat % width), kind="stable")]
+    starts = np.arange(taken + 1) * total // taken
+    sizes = np.diff(starts)
+    drawn = ordered[starts[:-1] + rng.integers(sizes)]
+    rank = np.argsort(np.argsort((rng.random() + np.arange(taken) * _GOLDEN) % 1.0))
+    return torch.from_numpy(drawn[rank]), torch.from_numpy(sizes[rank].astype(np.float32))
+
+
+def _morton(rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Bits of row and column in turn."""
+    code = np.zeros_like(rows)
+    for bit in range(31):
+        code |= ((columns >> bit) & 1) << (2 * bit) | ((rows >> bit) & 1) << (2 * bit + 1)
+    return code
+
+
+def draw_by_group(
+    groups: Ragged, size: int, count: int, rng: np.random.Generator
+) -> tuple[Int64[Tensor, "p"], Float[Tensor, "p"]]:
+    r"""Distinct pixels in random order, equally many of each group, and what each stands for.
+
+    A pixel that is in the groups g of sizes :math:`m_g`, of which :math:`d_g` are drawn, stands
+    for one over its probability to be drawn,
+
+    .. math:: 1 \Big/ \Bigl(1 - \prod_g (1 - d_g / m_g)\Bigr),
+
+    so that sums over drawn pixels, weighted so, estimate sums over all pixels of the groups
+    (Horvitz and Thompson 1952).
+
+    Args:
+        groups: Pixels of each group.
+        size: Pixels of the view.
+        count: How many at most. Overlapping groups may draw a pixel twice; it comes once.
+        rng: Draws them.
+    """
+    shares = equal_shares(torch.diff(groups.starts).tolist(), count, rng)
+    parts = [groups.values[:0]]
+    missed = torch.ones(size, dtype=torch.float64)
+    for index, share in enumerate(shares):
+        members = groups.row(index)
+        drawn = rng.choice(len(members), share, replace=False)
+        parts.append(members[torch.from_numpy(drawn)])
+        missed[members] *= 1.0 - share / len(members)
+    pixels = torch.unique(torch.cat(parts))
+    pixels = pixels[torch.from_numpy(rng.permutation(len(pixels)))]
+    return pixels, (1.0 / (1.0 - missed[pixels])).float()
+
+
+def equal_shares(sizes: list[int], count: int, rng: np.random.Generator) -> list[int]:
+    """How many of `count` each group gives: equally many, or all it has.
+
+    What does not divide goes to groups drawn by chance.
+    """
+    shares = [0] * len(sizes)
+    left, open_groups = min(count, sum(sizes)), list(range(len(sizes)))
+    while left > 0:
+        each = left // len(open_groups)
+        if each == 0:
+            for position in rng.permutation(len(open_groups))[:left].tolist():
+                shares[open_groups[position]] += 1
+            break
+        for group in open_groups:
+            more = min(each, sizes[group] - shares[group])
+            shares[group] += more
+            left -= more
+        open_groups = [group for group in open_groups if shares[group] < sizes[group]]
+    return shares
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SamplingOptions:
-    """Which pixels are drawn and what is kept of them."""
+class BatchGroup:
+    """Views whose drawn pixels are cut into batches together."""
 
-    pixels: int = 4000
-    """Pixels of each view in one draw; all there are where a view has fewer."""
+    views: Sequence[int]
+    """Indices of the views, ascending."""
 
-    sampling: Sampling = "uniform"
-    """uniform: all pixels that have something to learn alike. groups: equally many of each id
-    of a label map, or of each mask. strata: one of each of as many equal parts of the picture."""
+    offsets: Sequence[int]
+    """By view, which batch gets the first of what does not divide."""
 
-    min_weight: float = 0.0
-    """Blending weight in [0, 1] below which an entry of a row is left out and the row's others
-    are scaled to the same sum; 0 keeps all. Half of the entries carry 2 % of the light."""
+    count: int
+    """How many batches."""
 
-    views_per_batch: int | None = None
-    """Views that a batch has pixels of. None takes some of every view; losses of pairs of pixels
-    want many pixels of few views."""
+    def span(self, pixels: int, offset: int, index: int) -> tuple[int, int]:
+        """Which of a view's drawn pixels a batch takes.
 
-    memory: int = 1 << 30
-    """Bytes of drawn rows that are kept in memory; more go to files."""
+        They are in random order, and each batch takes an equal part. What does not divide goes
+        to other batches in each view, by the view's offset.
+        """
+        turned = (index + offset) % self.count
+        return pixels * turned // self.count, pixels * (turned + 1) // self.count
 
-    folder: Path | None = None
-    """Where those files go; None is the system's folder for temporary files."""
 
-    @boundary
-    def __post_init__(self) -> None:
-        convert_fields(self)
-        if self.pixels < 1:
-            raise RangeError(f"pixels: expected at least 1, got {self.pixels}.")
-        check_choice("sampling", self.sampling, get_args(Sampling))
-        if not 0 <= self.min_weight <= 1:
-            raise RangeError(f"min_weight: expected 0 to 1, got {self.min_weight}.")
-        if self.views_per_batch is not None and self.views_per_batch < 1:
-            raise RangeError(f"views_per_batch: expected at least 1, got {self.views_per_batch}.")
-        if self.memory < 0:
-            raise RangeError(f"memory: expected 0 or more bytes, got {self.memory}.")
-        if self.folder is not None and not self.folder.is_dir():
-            raise InputError(f"folder: expected an existing folder, got {self.folder}.")
+def batch_groups(
+    sizes: Sequence[int], batch: int, views_per_batch: int | None, rng: np.random.Generator
+) -> list[BatchGroup]:
+    """Groups of views that are cut into batches together: all, or some drawn by chance."""
+    if views_per_batch is None:
+        return [_group(sizes, range(len(sizes)), batch, rng)]
+    order = rng.permutation([view for view, size in enumerate(sizes) if size])
+    # As even as can be: what does not divide makes several groups smaller by one.
+    parts = np.array_split(order, math.ceil(len(order) / views_per_batch))
+    return [_group(sizes, sorted(part.tolist()), batch, rng) for part in parts]
+
+
+def _group(
+    sizes: Sequence[int], views: Sequence[int], batch: int, rng: np.random.Generator
+) -> BatchGroup:
+    total = sum(sizes[view] for view in views)
+    count = max(1, min(total, math.ceil(total / batch)))
+    # A view with fewer pixels than there are batches is in some of them only.
+    offsets = rng.integers(count, size=len(views)).tolist()
+    return BatchGroup(views=tuple(views), offsets=tuple(offsets), count=count)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -150,30 +257,8 @@ class DrawnRows:
         """How many batches there are."""
         return len(self._batches)
 
-    @property
-    def pixels(self) -> int:
-        """How many pixels were drawn."""
-        return sum(len(self._store[i]) for i in range(len(self._store)))
-
-    @property
-    def entries(self) -> int:
-        """How many entries of W their rows have."""
-        return sum(len(self._store[i].rows.ids) for i in range(len(self._store)))
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes of all rows and targets, in memory and in files."""
-        return sum(self._store[i].nbytes for i in range(len(self._store)))
-
-    @property
-    def spilled(self) -> int:
-        """Bytes of them that are in files."""
-        return self._store.spilled
-
     def batch(self, index: int) -> Batch:
         """One batch, ready for products."""
-        if not 0 <= index < len(self):
-            raise InputError(f"index: expected a batch below {len(self)}, got {index}.")
         group, position = self._batches[index]
         parts, views = [], []
         for view, offset in zip(group.views, group.offsets, strict=True):
@@ -323,13 +408,10 @@ class RowSampler:
             pixels: Pixels of a view, if not as many as the options say.
 
         Raises:
-            RangeError: If `batch` is less than 1.
             InputError: If no view has anything to learn.
             SplatsegError: If rows beyond the memory budget cannot be written.
         """
-        if batch < 1:
-            raise RangeError(f"batch: expected at least 1, got {batch}.")
-        store = RowStore(memory=self._options.memory, folder=self._options.folder)
+        store = RowStore(self._options.memory)
         try:
             for view in self._views:
                 store.append(self._drawn(view, rng, pixels or self._options.pixels))
@@ -369,11 +451,7 @@ class RowSampler:
         asked = torch.stack((flat % camera.width, flat // camera.width), dim=-1)
         with torch.no_grad():
             found = weights(
-                self._gaussians,
-                camera,
-                asked,
-                options=self._render_options,
-                backend=self._backend,
+                self._gaussians, camera, asked, options=self._render_options, backend=self._backend
             )
         return found.to("cpu", dtype=torch.float16)
 

@@ -1,8 +1,10 @@
 """What pixels are trained towards: targets of any number a pixel, and the groups pixels come in."""
 
 import hashlib
+import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -10,9 +12,11 @@ import torch
 from jaxtyping import Int64
 from torch import Tensor
 
-from splatseg.core import UNLABELLED, LabelMap, MaskSet
+from splatseg.core import UNLABELLED, LabelMap, LabelSource, MaskSet
 from splatseg.core.boundary import boundary, convert_fields
-from splatseg.errors import InputError, ShapeError
+from splatseg.errors import InputError, ShapeError, SplatsegError
+from splatseg.io.arrays import read_npy
+from splatseg.render import SparseWeights
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -112,20 +116,6 @@ class TargetSource(Protocol):
 
 
 @runtime_checkable
-class LabelMaps(Protocol):
-    """A source of label maps, such as `splatseg.io.evidence.Evidence`."""
-
-    @property
-    def view_names(self) -> Sequence[str]:
-        """Views that have a map."""
-        ...
-
-    def label_map(self, name: str) -> LabelMap:
-        """The label map of a view."""
-        ...
-
-
-@runtime_checkable
 class MaskSets(Protocol):
     """A source of masks, such as `splatseg.io.evidence.Evidence`."""
 
@@ -154,7 +144,7 @@ class LabelTargets:
     """
 
     @boundary
-    def __init__(self, evidence: LabelMaps, names: Sequence[str]) -> None:
+    def __init__(self, evidence: LabelSource, names: Sequence[str]) -> None:
         self._evidence = evidence
         self._names = tuple(sorted(names))
         digest = hashlib.sha256()
@@ -211,10 +201,7 @@ class LabelTargets:
         confidence = torch.ones(len(pixels))
         if label_map.confidence is not None:
             confidence = label_map.confidence.cpu().float().reshape(-1)[pixels]
-        return {
-            "label": torch.searchsorted(self._ids, flat[pixels]),
-            "confidence": confidence,
-        }
+        return {"label": torch.searchsorted(self._ids, flat[pixels]), "confidence": confidence}
 
     def _label_map(self, name: str) -> LabelMap:
         """The map of a view; that of the last one asked for is still there."""
@@ -290,3 +277,150 @@ class MaskTargets:
 
 def _starts(sizes: Tensor) -> Int64[Tensor, "rows_plus_1"]:
     return torch.cat((sizes.new_zeros(1), torch.cumsum(sizes, dim=0))).long()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DrawnView:
+    """The pixels drawn of one view. Where they are spilled, its tensors are mapped files."""
+
+    rows: SparseWeights
+    pixels: Tensor
+    """int64 (p,), numbered row by row."""
+
+    stands_for: Tensor
+    """float32 (p,), how many pixels of the view each one stands for."""
+
+    targets: Targets
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+    def slice(self, begin: int, end: int) -> "DrawnView":
+        """Consecutive pixels."""
+        return DrawnView(
+            rows=_consecutive(self.rows, begin, end),
+            pixels=self.pixels[begin:end],
+            stands_for=self.stands_for[begin:end],
+            targets={name: _slice(target, begin, end) for name, target in self.targets.items()},
+        )
+
+    def arrays(self) -> dict[str, Tensor]:
+        """All tensors by the names they are filed under."""
+        found = {
+            "rows.indptr": self.rows.indptr,
+            "rows.ids": self.rows.ids,
+            "rows.weights": self.rows.weights,
+            "pixels": self.pixels,
+            "stands_for": self.stands_for,
+        }
+        for name, target in self.targets.items():
+            if isinstance(target, Ragged):
+                found[f"targets.{name}.starts"] = target.starts
+                found[f"targets.{name}.values"] = target.values
+            else:
+                found[f"targets.{name}"] = target
+        return found
+
+    def with_arrays(self, arrays: dict[str, Tensor]) -> "DrawnView":
+        """The same with tensors of the same values in other memory. Inverse of `arrays`."""
+
+        def target(name: str, value: Target) -> Target:
+            if isinstance(value, Ragged):
+                starts, values = (arrays[f"targets.{name}.{part}"] for part in ("starts", "values"))
+                return Ragged(starts=starts, values=values)
+            return arrays[f"targets.{name}"]
+
+        return DrawnView(
+            rows=replace(
+                self.rows,
+                indptr=arrays["rows.indptr"],
+                ids=arrays["rows.ids"],
+                weights=arrays["rows.weights"],
+            ),
+            pixels=arrays["pixels"],
+            stands_for=arrays["stands_for"],
+            targets={name: target(name, value) for name, value in self.targets.items()},
+        )
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes it holds, in memory or in files."""
+        return sum(tensor.nbytes for tensor in self.arrays().values())
+
+
+def _consecutive(rows: SparseWeights, begin: int, end: int) -> SparseWeights:
+    first, last = int(rows.indptr[begin]), int(rows.indptr[end])
+    return replace(
+        rows,
+        indptr=rows.indptr[begin : end + 1] - first,
+        ids=rows.ids[first:last],
+        weights=rows.weights[first:last],
+    )
+
+
+def _slice(target: Target, begin: int, end: int) -> Target:
+    return target.slice(begin, end) if isinstance(target, Ragged) else target[begin:end]
+
+
+class RowStore:
+    """Keeps drawn views; those that would exceed the budget are memory-mapped NumPy files.
+
+    The files lie in a temporary folder that goes with the store.
+
+    Args:
+        memory: Bytes that are kept in memory.
+    """
+
+    def __init__(self, memory: int) -> None:
+        self._left = memory
+        self._holder: tempfile.TemporaryDirectory[str] | None = None
+        self._views: list[DrawnView] = []
+
+    def __len__(self) -> int:
+        return len(self._views)
+
+    def __getitem__(self, index: int) -> DrawnView:
+        return self._views[index]
+
+    def append(self, view: DrawnView) -> None:
+        """Keep a view.
+
+        Raises:
+            SplatsegError: If it is too much for memory and cannot be written.
+        """
+        size = view.nbytes
+        if size <= self._left:
+            self._left -= size
+            self._views.append(view)
+            return
+        self._views.append(self._on_disk(view))
+
+    def close(self) -> None:
+        """Forget all views and remove the files."""
+        self._views.clear()
+        if self._holder is not None:
+            self._holder.cleanup()
+            self._holder = None
+
+    def _on_disk(self, view: DrawnView) -> DrawnView:
+        try:
+            if self._holder is None:
+                self._holder = tempfile.TemporaryDirectory(prefix="splatseg-rows-")
+            folder = Path(self._holder.name) / f"{len(self._views):06d}"
+            folder.mkdir()
+            return view.with_arrays(
+                {name: _mapped(folder / f"{name}.npy", t) for name, t in view.arrays().items()}
+            )
+        except OSError as error:
+            raise SplatsegError(
+                f"{tempfile.gettempdir()}: rows beyond the memory budget cannot be written "
+                f"({error})."
+            ) from error
+
+
+def _mapped(path: Path, tensor: Tensor) -> Tensor:
+    np.save(path, tensor.numpy(), allow_pickle=False)
+    if not tensor.numel():  # an empty file cannot be mapped
+        return tensor
+    # Copy on write: torch wants arrays it may write to, and the file is to stay as it is.
+    return torch.from_numpy(read_npy(path, mapped=True))

@@ -1,53 +1,150 @@
-"""The loop: draw, step, score, stop."""
+"""What is trained: arrays with a row a Gaussian, shared arrays, and a loss of a batch of pixels."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 from splatseg.core.boundary import boundary
 from splatseg.core.checkpoints import Checkpoints, Interrupts, deferred_interrupts
 from splatseg.core.threads import one_torch_thread
-from splatseg.lift.training._adam import AdamConstants, RowAdam
-from splatseg.lift.training._file import TrainingFile
-from splatseg.lift.training._model import Model, Values
-from splatseg.lift.training._options import TrainingOptions, rate_factor
-from splatseg.lift.training._sampler import (
-    Batch,
-    DrawnRows,
-    RowSampler,
-    SamplingOptions,
-    held_out_views,
-)
-from splatseg.lift.training._state import TrainingState
+from splatseg.lift.training._options import SamplingOptions, TrainingOptions, rate_factor
+from splatseg.lift.training._sampler import Batch, DrawnRows, RowSampler, held_out_views
+from splatseg.lift.training._state import AdamConstants, RowAdam, TrainingFile, TrainingState
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Parameter:
+    """Where an array starts, and how fast it learns."""
+
+    start: Tensor
+    """float32; one row a Gaussian, or of any shape if it is shared."""
+
+    rate: float
+    """Adam's learning rate, before the schedule."""
+
+
+@runtime_checkable
+class Model(Protocol):
+    """What can be trained on rows of W.
+
+    Rows of Gaussians that neither a batch nor the loss asks for cost nothing in a step.
+    """
+
+    @property
+    def row_parameters(self) -> Mapping[str, Parameter]:
+        """Arrays (n, channels) with a row a Gaussian, by name."""
+        ...
+
+    @property
+    def shared_parameters(self) -> Mapping[str, Parameter]:
+        """All other arrays (a network's weights), by name."""
+        ...
+
+    def loss(self, batch: Batch, values: "Values") -> Float[Tensor, ""]:
+        """What to make small, differentiable towards the values asked for.
+
+        Random choices come from ``values.rng`` alone.
+        """
+        ...
+
+    def score(self, batches: Sequence[Batch], values: "Values") -> float:
+        """How good the values are on held-out pixels; higher is better."""
+        ...
+
+
+class Values:
+    """The values of all parameters in one step, with gradients where they are asked for.
+
+    Args:
+        row_values: Arrays with a row a Gaussian.
+        shared: All others.
+        rng: For random choices of the loss.
+        step: 1 for the first.
+        differentiable: Whether gradients will be asked for.
+    """
+
+    @boundary
+    def __init__(
+        self,
+        row_values: Mapping[str, Tensor],
+        shared: Mapping[str, Tensor],
+        *,
+        rng: np.random.Generator,
+        step: int,
+        differentiable: bool,
+    ) -> None:
+        self._row_values = row_values
+        self._shared = {
+            name: value.detach().requires_grad_(differentiable) for name, value in shared.items()
+        }
+        self._asked: list[tuple[str, Tensor, Tensor]] = []
+        self._differentiable = differentiable
+        self._kept: dict[str, Tensor] = {}
+        self.rng = rng
+        self.step = step
+
+    @property
+    def shared(self) -> Mapping[str, Tensor]:
+        """Shared arrays, by name."""
+        return self._shared
+
+    def rows(self, name: str, index: Int64[Tensor, "t"]) -> Float[Tensor, "t channels"]:
+        """Some rows of an array; `index` is distinct."""
+        picked = self._row_values[name].index_select(0, index)
+        if self._differentiable:
+            picked.requires_grad_()
+            self._asked.append((name, index, picked))
+        return picked
+
+    def keep(self, name: str, value: Tensor) -> None:
+        """Set a shared array that no gradient moves, such as running statistics.
+
+        `shared` has it at once, and the training from this step on.
+        """
+        self._kept[name] = value.detach()
+        self._shared[name] = self._kept[name]
+
+    @property
+    def kept(self) -> Mapping[str, Tensor]:
+        """What `keep` was given, by name."""
+        return self._kept
+
+    def render(self, name: str, batch: Batch) -> Float[Tensor, "pixels channels"]:
+        """An array as a batch's pixels show it: ``W @ array``."""
+        return batch.weights.product(self.rows(name, batch.weights.touched))
+
+    def row_gradients(self, name: str) -> tuple[Tensor, Tensor]:
+        """The rows of an array that the loss depends on, and the loss's gradient in them."""
+        found = [
+            (index, leaf.grad)
+            for asked, index, leaf in self._asked
+            if asked == name and leaf.grad is not None
+        ]
+        if not found:
+            value = self._row_values[name]
+            return torch.zeros(0, dtype=torch.int64, device=value.device), value[:0]
+        if len(found) == 1:
+            return found[0]
+        rows, position = torch.unique(torch.cat([index for index, _ in found]), return_inverse=True)
+        total = found[0][1].new_zeros(len(rows), found[0][1].shape[1])
+        begin = 0
+        for index, gradient in found:
+            total[position[begin : begin + len(index)]] += gradient
+            begin += len(index)
+        return rows, total
+
+
+HELD_OUT_PIXELS = 4000
+"""Pixels of each held-out view that are scored."""
 
 # What the generators of a training are seeded with besides the seed and a number.
 _DRAW, _ORDER, _STEP, _HELD_OUT, _SCORE = range(5)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TrainingProgress:
-    """Where a training is."""
-
-    step: int
-    """Steps done."""
-
-    steps: int
-    """Steps at most."""
-
-    loss: float
-    """Of the last step."""
-
-    score: float | None
-    """The last score on held-out views; None before the first."""
-
-    best_score: float | None
-    """The best so far."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -93,8 +190,7 @@ def train(
     checkpoints: Checkpoints | None = None,
     settings: Mapping[str, Any] | None = None,
     defaults: Mapping[str, Any] | None = None,
-    progress: Callable[[TrainingProgress], None] | None = None,
-    cancelled: Callable[[], bool] | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> TrainingResult:
     """Train a model on rows of W.
 
@@ -113,8 +209,8 @@ def train(
         settings: What else must be the same to resume, in values that JSON holds: the model's
             own options.
         defaults: Their defaults: what counts where a checkpoint does not name one.
-        progress: Called after each step. An exception from it leaves a checkpoint, too.
-        cancelled: Called after each step; True is as good as Ctrl-C.
+        progress: Called after each step with the steps done and all there are to do. An exception
+            from it leaves a checkpoint, too.
 
     Raises:
         KeyboardInterrupt: If it was interrupted.
@@ -130,7 +226,7 @@ def train(
         run.state = file.saved(run.state)
     with nullcontext(Interrupts()) if file is None else deferred_interrupts() as interrupts:
         try:
-            _run_steps(run, file, interrupts, progress=progress, cancelled=cancelled)
+            _run_steps(run, file, interrupts, progress)
         finally:
             run.close()
         if interrupts.requested:  # while the last checkpoint was written
@@ -142,17 +238,15 @@ def _run_steps(
     run: "_Run",
     file: TrainingFile | None,
     interrupts: Interrupts,
-    *,
-    progress: Callable[[TrainingProgress], None] | None,
-    cancelled: Callable[[], bool] | None,
+    progress: Callable[[int, int], None] | None,
 ) -> None:
     """Step until the training is finished; what ends it earlier leaves a checkpoint."""
     while not run.finished:
         run.advance()
         with nullcontext() if file is None else file.written_on_error(run.state):
             if progress is not None:
-                progress(run.progress())
-            if interrupts.requested or (cancelled is not None and cancelled()):
+                progress(run.state.step, run.steps)
+            if interrupts.requested:
                 raise KeyboardInterrupt
         if file is not None and file.due(run.state):
             file.write(run.state)
@@ -170,8 +264,7 @@ def _identity(
     """What must be the same to resume: where drawn rows are kept changes nothing."""
     drawn = asdict(sampler.options)
     default = asdict(SamplingOptions())
-    for name in ("memory", "folder"):
-        del drawn[name], default[name]
+    del drawn["memory"], default["memory"]
     given = {"seed": seed, "backend": sampler.backend} | drawn | asdict(options) | dict(settings)
     return {
         "data": sampler.fingerprints,
@@ -196,6 +289,7 @@ class _Run:
         kept, held_out = held_out_views(sampler.views, options.held_out)
         self._model = model
         self._options = options
+        self.steps = options.steps
         self._seed = seed
         self._sampler = sampler.of_views(kept)
         self._held_out = sampler.of_views(held_out) if held_out else None
@@ -205,7 +299,7 @@ class _Run:
             name: parameter.rate
             for name, parameter in {**model.row_parameters, **model.shared_parameters}.items()
         }
-        constants = AdamConstants(beta1=options.beta1, beta2=options.beta2, epsilon=options.epsilon)
+        constants = AdamConstants(epsilon=options.epsilon)
         self._adam = RowAdam(constants, max_steps=options.steps)
         self.state: TrainingState = TrainingState.started(
             {name: parameter.start for name, parameter in model.row_parameters.items()},
@@ -225,10 +319,10 @@ class _Run:
 
     @property
     def _best_index(self) -> int:
-        """Index of the best score: the last that exceeded the best before it by the gain."""
+        """Index of the best score: the first of the highest."""
         best = 0
         for index, (_, score) in enumerate(self.state.scores):
-            if score > self.state.scores[best][1] + self._options.min_gain:
+            if score > self.state.scores[best][1]:
                 best = index
         return best
 
@@ -245,17 +339,6 @@ class _Run:
         due = state.step % options.score_every == 0 or last
         if self._held_out is not None and due:
             self._score()
-
-    def progress(self) -> TrainingProgress:
-        """Where it is."""
-        scores = self.state.scores
-        return TrainingProgress(
-            step=self.state.step,
-            steps=self._options.steps,
-            loss=self.state.losses[-1],
-            score=scores[-1][1] if scores else None,
-            best_score=scores[self._best_index][1] if scores else None,
-        )
 
     def result(self) -> TrainingResult:
         """What was learnt."""
@@ -353,9 +436,7 @@ class _Run:
             return
         if not self._scored:
             with self._held_out.draw(
-                self._rng(_HELD_OUT),
-                batch=self._options.batch,
-                pixels=self._options.held_out_pixels,
+                self._rng(_HELD_OUT), batch=self._options.batch, pixels=HELD_OUT_PIXELS
             ) as drawn:
                 self._scored = [drawn.batch(index) for index in range(len(drawn))]
         values = Values(

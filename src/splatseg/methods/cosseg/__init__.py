@@ -24,10 +24,9 @@ from typing import Any
 
 from splatseg.core import InstanceTree, Labels, LabelSource, Layer
 from splatseg.io.evidence import TrackedEvidence
-from splatseg.lift.segments.matching import MatchedMaps
-from splatseg.lift.segments.recorded import EvidenceSegments
+from splatseg.lift.segments import EvidenceSegments, MatchedMaps
 from splatseg.methods._method import Method, MethodInputs, Refined
-from splatseg.methods._trained_labels import context_of, hard_labels
+from splatseg.methods._trained import context_of, hard_labels
 from splatseg.methods.associate import associate
 from splatseg.methods.cosseg.features import BlockSource as BlockSource
 from splatseg.methods.cosseg.features import distilled_features as distilled_features

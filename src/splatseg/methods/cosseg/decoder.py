@@ -34,8 +34,7 @@ from torch.nn.functional import batch_norm, embedding, leaky_relu
 
 from splatseg.errors import ShapeError
 from splatseg.lift.training import Batch, Parameter, Values
-from splatseg.methods._label_losses import TINY, LabelCounts
-from splatseg.methods._label_models import linear_start
+from splatseg.methods._trained import TINY, LabelCounts, linear_start
 from splatseg.methods.cosseg.network import MOMENTUM
 from splatseg.methods.cosseg.options import CossegOptions
 from splatseg.methods.cosseg.points import FusionInputs, PointSet

@@ -34,8 +34,8 @@ from torch.nn.functional import normalize
 from splatseg.core import FeatureMap, Gaussians, View
 from splatseg.core.models import DeepFeatures
 from splatseg.errors import InputError, ShapeError
-from splatseg.lift.mass.adjoint import voting_views
-from splatseg.lift.mass.features import FeatureUpliftOptions, uplift_features
+from splatseg.lift.voting.features import FeatureUpliftOptions, uplift_features
+from splatseg.lift.voting.uplift import voting_views
 from splatseg.methods.cosseg.options import COMPONENTS, LIFTED_SIDE
 from splatseg.render import RenderOptions, options_for, weights
 

@@ -36,7 +36,7 @@ from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError
 from splatseg.fit import FitOptions, Refinement
 from splatseg.lift.training import TrainingResult
-from splatseg.methods._trained_labels import TrainingContext, label_data
+from splatseg.methods._trained import TrainingContext, label_data
 from splatseg.methods.cosseg.decoder import (
     DROPPED,
     RUNNING,

@@ -6,9 +6,9 @@ from typing import Literal
 
 from splatseg.core.options import Count, NonNegative, options
 from splatseg.errors import RangeError
-from splatseg.lift.heads import Blend
+from splatseg.lift.label_maps import Blend
 from splatseg.lift.training import SamplingOptions, TrainingOptions
-from splatseg.methods._trained_options import LabelTrainingOptions
+from splatseg.methods._trained import LabelTrainingOptions
 
 Spatial = Literal["all", "first", "none"]
 

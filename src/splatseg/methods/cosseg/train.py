@@ -17,9 +17,9 @@ from splatseg.core.boundary import boundary
 from splatseg.core.rigid import upright
 from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError
-from splatseg.lift.heads import Blend, ClassifierHead
+from splatseg.lift.label_maps import Blend, ClassifierHead
 from splatseg.lift.training import TrainingResult, held_out_views
-from splatseg.methods._trained_labels import (
+from splatseg.methods._trained import (
     LabelData,
     TrainingContext,
     label_data,

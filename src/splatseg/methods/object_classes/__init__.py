@@ -47,13 +47,13 @@ from splatseg.core import (
     LayerInfo,
     View,
 )
+from splatseg.core.evidence import SegmentSource
 from splatseg.core.options import Count, Share, options
 from splatseg.errors import InputError
 from splatseg.io.evidence import PanopticEvidence, TrackedEvidence
-from splatseg.lift.mass.confusion import correct_confusion
-from splatseg.lift.mass.uplift import UpliftOptions, uplift
-from splatseg.lift.segments.recorded import EvidenceSegments
-from splatseg.lift.segments.table import SegmentSource
+from splatseg.lift.segments import EvidenceSegments
+from splatseg.lift.voting.confusion import correct_confusion
+from splatseg.lift.voting.uplift import UpliftOptions, uplift
 from splatseg.methods._method import Method, MethodInputs
 from splatseg.methods.associate import associate
 from splatseg.methods.cosseg.features import BlockSource, distilled_features

@@ -38,9 +38,9 @@ from splatseg.core import (
 from splatseg.core.models import Image
 from splatseg.errors import InputError, ShapeError
 from splatseg.io.evidence import Evidence
-from splatseg.lift.mass.features import checked_grid
-from splatseg.lift.mass.segment_masses import ViewMasses, view_masses
 from splatseg.lift.phrases import ThingLooks, thing_looks
+from splatseg.lift.voting.features import checked_grid
+from splatseg.lift.voting.segment_masses import ViewMasses, view_masses
 from splatseg.methods.objects import MixingModel
 from splatseg.render import prepare
 

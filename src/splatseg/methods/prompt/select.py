@@ -26,7 +26,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from splatseg.core import Gaussians, Prompt, Rle, View
-from splatseg.lift.mass.centres import centres_in, unoccluded
 from splatseg.methods.prompt.masks import PromptedMasks
 from splatseg.methods.prompt.options import PromptOptions, VoteRule
 from splatseg.methods.prompt.views import (
@@ -37,6 +36,7 @@ from splatseg.methods.prompt.views import (
     seed_of,
 )
 from splatseg.methods.prompt.words import FoundObject
+from splatseg.methods.vote import centres_in, unoccluded
 from splatseg.neighbours import NeighbourIndex
 from splatseg.render import PreparedView, RenderOptions, SparseImage, options_for, prepare
 

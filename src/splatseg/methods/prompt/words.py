@@ -25,11 +25,10 @@ from torch import Tensor
 from splatseg.core import FeatureSource, Gaussians, MaskSet, Rle, View
 from splatseg.core.models import GroundedMasks, Image
 from splatseg.errors import InputError
-from splatseg.lift.mass.features import checked_grid
-from splatseg.lift.mass.segment_masses import view_masses
 from splatseg.lift.phrases import answer_phrases
-from splatseg.lift.relevancy import relevancy
-from splatseg.lift.vocabulary import Vocabulary
+from splatseg.lift.vocabulary import Vocabulary, relevancy
+from splatseg.lift.voting.features import checked_grid
+from splatseg.lift.voting.segment_masses import view_masses
 from splatseg.lift.words import TEMPERATURE, WordAnswers, answer_words, context_of, word_span
 from splatseg.methods.prompt.masks import MaskTable, image_of, mask_overlaps
 from splatseg.methods.prompt.options import PromptOptions

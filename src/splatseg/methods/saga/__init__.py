@@ -29,7 +29,7 @@ from dataclasses import replace
 from splatseg.core import Features, InstanceTree
 from splatseg.lift.affinity import AffinityHead
 from splatseg.methods._method import Method, MethodInputs
-from splatseg.methods._trained_labels import context_of
+from splatseg.methods._trained import context_of
 from splatseg.methods.saga.decomposition import DecomposeOptions, decompose
 from splatseg.methods.saga.options import SHORT_STEPS
 from splatseg.methods.saga.options import SagaOptions as SagaOptions

@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits, normalize
 
 from splatseg.core import UNLABELLED
-from splatseg.lift.projector import project_features, projector_start
+from splatseg.lift.affinity import project_features, projector_start
 from splatseg.lift.training import Batch, Parameter, Values
 from splatseg.methods.saga.masks import OBJECT_END, PART_END, LevelMasks, divisions, level_cut
 from splatseg.methods.saga.options import PUBLISHED_RATE, SagaOptions

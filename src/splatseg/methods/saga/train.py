@@ -23,8 +23,6 @@ from splatseg.core.boundary import boundary
 from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError, ShapeError
 from splatseg.lift.affinity import AffinityHead
-from splatseg.lift.mass.adjoint import voting_views
-from splatseg.lift.mass.features import read_features_at
 from splatseg.lift.training import (
     MaskSets,
     MaskTargets,
@@ -36,7 +34,9 @@ from splatseg.lift.training import (
     TrainingResult,
     train,
 )
-from splatseg.methods._trained_labels import TrainingContext, loss_curve
+from splatseg.lift.voting.features import read_features_at
+from splatseg.lift.voting.uplift import voting_views
+from splatseg.methods._trained import TrainingContext, loss_curve
 from splatseg.methods.associate import associate_masks
 from splatseg.methods.saga.masks import (
     GROUP_SCALE,

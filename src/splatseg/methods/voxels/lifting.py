@@ -46,10 +46,10 @@ from splatseg.core.sh import base_colours
 from splatseg.core.threads import one_torch_thread
 from splatseg.core.voxels import VoxelGrid
 from splatseg.errors import InputError, ShapeError
-from splatseg.lift.completion.graph import NodeAttributes, neighbour_graph
 from splatseg.lift.label_maps import label_map
-from splatseg.lift.mass.adjoint import RenderAdjoint, voting_views
-from splatseg.lift.mass.features import Taps, camera_of_grid, checked_grid, grid_taps, read_grid
+from splatseg.lift.neighbour_graph import NodeAttributes, neighbour_graph
+from splatseg.lift.voting.features import Taps, camera_of_grid, checked_grid, grid_taps, read_grid
+from splatseg.lift.voting.uplift import RenderAdjoint, voting_views
 from splatseg.methods.objects import pixel_cells
 from splatseg.methods.voxels.grid import GridIndex, nearest_voxels
 from splatseg.render import options_for

@@ -25,8 +25,7 @@ from splatseg.core.boundary import boundary
 from splatseg.core.threads import one_torch_thread
 from splatseg.core.voxels import CODES, StoredPrecision, StoredTable, VoxelFeatures
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.lift.relevancy import TextSpace
-from splatseg.lift.vocabulary import Vocabulary
+from splatseg.lift.vocabulary import TextSpace, Vocabulary
 from splatseg.lift.words import (
     MIN_ENERGY,
     SAME_MEANING,

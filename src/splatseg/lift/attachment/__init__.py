@@ -1,1 +1,0 @@
-"""Labels put back on splats that an editor changed."""

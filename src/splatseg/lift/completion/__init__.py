@@ -1,1 +1,0 @@
-"""Labels of Gaussians that no view explains, by their neighbours."""

@@ -1,1 +1,0 @@
-"""Label mass: blending weight of each Gaussian per id, summed over views, and labels from it."""

@@ -1,1 +1,0 @@
-"""Segments of views, and which of them are of one thing."""
