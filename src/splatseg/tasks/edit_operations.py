@@ -218,7 +218,7 @@ class Cut:
 
 def cut_of(document: Document, where: Where, cut: Cut, observer: Observer) -> CutBy | None:
     """How the boundary of what is selected is found, or None where nothing is split."""
-    if cut.by == "off" or cut.options.rounds == 0:
+    if cut.by == "off":
         return None
     if cut.by == "box" or where.layer is None:
         if where.box is None and cut.by == "auto":

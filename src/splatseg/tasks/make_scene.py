@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from splatseg.core import Capture, View
-from splatseg.core.boundary import boundary, convert_fields
+from splatseg.core.boundary import boundary
 from splatseg.core.checkpoints import Checkpoints, deferred_interrupts
 from splatseg.errors import InputError
 from splatseg.evaluate import PhotographReport, evaluate_photographs, render_and_photograph
@@ -33,17 +33,15 @@ from splatseg.render import BackendName
 from splatseg.report.fit_report import FitReportData, FitVerdict, fit_record, fit_report, verdict_of
 from splatseg.report.images import Gallery, GalleryImage, colour_difference
 from splatseg.report.maps import camera_map
-from splatseg.tasks.checkpoints import CheckpointOptions, check_fit_output, fit_folder
+from splatseg.tasks.checkpoints import check_fit_output, fit_folder
 from splatseg.tasks.moving import (
     LeftOut,
-    MovingClock,
     capture_without_moving,
     moving_things,
     without_moving_points,
 )
 from splatseg.tasks.photographs import (
     MakeSceneOptions,
-    Poses,
     capture_of,
     with_depth_evidence,
     with_scans,
@@ -56,8 +54,6 @@ from splatseg.tasks.work import (
     versions,
     write_page,
 )
-
-
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

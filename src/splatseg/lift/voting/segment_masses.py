@@ -23,7 +23,7 @@ from torch import Tensor
 from splatseg import _native
 from splatseg.core import UNLABELLED, Camera, Gaussians, LabelMap, MaskSet
 from splatseg.errors import ShapeError
-from splatseg.render import ImageWeights, SparseWeights, weights
+from splatseg.render import SparseWeights, image_weights, weights
 from splatseg.render.warp import undistorted_camera, warp_into_photograph
 
 _LAYERS = 12
@@ -343,9 +343,7 @@ def _image_sums(
     """The sums of a whole image, one band: the faster way, without rows of pixels."""
     import scipy.sparse
 
-    image = weights(gaussians, camera, layout="blocks", backend=backend)
-    if not isinstance(image, ImageWeights):
-        raise TypeError(f"weights: expected those of an image, got {type(image).__name__}.")
+    image = image_weights(gaussians, camera, backend=backend)
     found: list[list[Any]] = []
     for pieces in runs:
         sums = image.part_sums(torch.from_numpy(pieces.piece).to(gaussians.device))

@@ -100,7 +100,6 @@ class CossegOptions(LabelTrainingOptions):
     """Steps of joint training, each with one whole picture."""
 
     def __post_init__(self) -> None:
-        LabelTrainingOptions.__post_init__(self)
         if self.spatial == "none" and self.semantic == "none":
             raise RangeError("semantic, spatial: expected one of the two, got neither.")
 

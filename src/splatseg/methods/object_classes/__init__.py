@@ -230,13 +230,7 @@ def label_objects(
         backend=backend,
     )
     tell(1)
-    instances = associate(
-        gaussians,
-        views,
-        masks,
-        render_options=render_options,
-        backend=backend,
-    )
+    instances = associate(gaussians, views, masks, backend=backend)
     # Those of a tree where segments may overlap.
     objects = instances.cut("object") if isinstance(instances, InstanceTree) else instances
     tell(2)

@@ -261,7 +261,6 @@ def train_saga(
         settings={"method": "saga"} | _settings(options),
         defaults=_settings(SagaOptions()),
         progress=context.progress,
-        cancelled=context.cancelled,
     )
     trained, unit = result.rows["features"], not options.is_published
     head = AffinityHead(
@@ -296,13 +295,7 @@ def _started(
     if options.is_published:
         drawn = rng.standard_normal((len(gaussians), CHANNELS), dtype=np.float32)
         return torch.from_numpy(drawn), None
-    found = associate_masks(
-        gaussians,
-        views,
-        MaskSegments(evidence),
-        render_options=context.render_options,
-        backend=context.backend,
-    )
+    found = associate_masks(gaussians, views, MaskSegments(evidence), backend=context.backend)
     nodes = np.concatenate([found.nodes[view.name] for view in views])
     with one_torch_thread():
         start = association_start(found.tree, CHANNELS, rng)

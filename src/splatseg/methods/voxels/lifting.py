@@ -220,7 +220,6 @@ class _WeightMeans:
                     values[..., part],
                     cells=(covered[0] / features.stride, covered[1] / features.stride),
                     size=(camera.height, camera.width),
-                    resampling="bilinear",
                 )
                 sums, weights = self._adjoint.back_project(prepared, image)
                 if not start:
