@@ -12,7 +12,7 @@ from splatseg.errors import InputError, ShapeError
 from splatseg.methods.prompt.options import PromptOptions
 from splatseg.prompting import pipeline
 from splatseg.prompting.prompts import AxisBox, Ball, Lasso, Similar, ViewPrompt
-from splatseg.tasks import SelectOptions, open_selector, select, select_session
+from splatseg.tasks import SelectOptions, open_selector, select
 from support.wall import camera, field_ids, wall
 
 IN_1, IN_4 = (12.5, 15.5), (26.5, 25.5)
@@ -221,7 +221,9 @@ def test_a_session_opens_its_source_once_and_keeps_nothing_else(world) -> None:
 
 def test_who_advises_is_asked_with_the_final_confidence(world, monkeypatch) -> None:
     heard = []
-    monkeypatch.setattr(select_session, "next_click", lambda c, context: heard.append((c, context)))
+    monkeypatch.setattr(
+        "splatseg.tasks.select.next_click", lambda c, context: heard.append((c, context))
+    )
     made = world.select(world.click(IN_1), advise=True)
     ((confidence, context),) = heard
     assert torch.equal(confidence, made.selection.confidence)

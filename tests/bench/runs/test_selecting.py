@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from splatseg.tasks._select_sources import Offer
 
 from splatseg.core import (
     Features,
@@ -28,7 +27,7 @@ from splatseg.lift import GaussianField
 from splatseg.lift.affinity import AffinityHead
 from splatseg.methods import Method, MethodInputs, _method, register_method
 from splatseg.methods.uplift import UpliftMethodOptions
-from splatseg.tasks.sources import OpenedSource, open_source
+from splatseg.tasks.sources import OpenedSource, SourceRequest, open_source
 from splatseg_bench.answers import BySelection, stroke_prompt
 from splatseg_bench.layouts import read_benchmark
 from splatseg_bench.options import BenchOptions
@@ -148,7 +147,7 @@ def test_features_trained_as_published_answer_as_published(
     """Thresholds of section 3.4 and what follows in section 3.5, by the record of the layer."""
     asked: list[tuple[str | None, bool]] = []
 
-    def opened(offer: Offer) -> OpenedSource:
+    def opened(offer: SourceRequest) -> OpenedSource:
         found = open_source(offer)
         asked.append((found.rule, found.published))
         return found
