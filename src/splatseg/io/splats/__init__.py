@@ -56,7 +56,7 @@ _READERS: Mapping[SplatFormat, Callable[..., Gaussians]] = {
 @dataclass(frozen=True, slots=True)
 class _Writer:
     label: str
-    write: Callable[[Gaussians, Path, Losses], None]
+    write: Callable[..., None]
     keeps: tuple[Literal["extra", "antialiased", "low_pass"], ...] = ()
     """What it has a place for beside the Gaussians."""
 
@@ -67,7 +67,7 @@ _WRITERS: Mapping[WritableFormat, _Writer] = {
     ),
     "ply": _Writer(
         "a PLY file",
-        lambda gaussians, path, _: write_ply(gaussians, path),
+        write_ply,
         ("extra", "antialiased", "low_pass"),
     ),
     "splat": _Writer("a .splat file", write_splat),
@@ -198,7 +198,7 @@ def write_splats(
     writer = _WRITERS[chosen]
     losses = Losses(target, writer.label)
     with atomic_file(target) as temporary:
-        writer.write(gaussians, temporary, losses)
+        writer.write(gaussians, temporary, losses=losses)
     if gaussians.extra and "extra" not in writer.keeps:
         losses.drop("the extra columns " + ", ".join(sorted(gaussians.extra)))
     if gaussians.antialiased and "antialiased" not in writer.keeps:

@@ -173,7 +173,7 @@ def _between(
     return low * (1 - share) + high * share
 
 
-def write_compressed_ply(gaussians: Gaussians, path: Path, losses: Losses) -> None:
+def write_compressed_ply(gaussians: Gaussians, path: Path, *, losses: Losses) -> None:
     """Write a compressed PLY file. Gaussians are put in Morton order of their positions.
 
     The order is what makes chunks small and with them the steps of positions; `Gaussians`

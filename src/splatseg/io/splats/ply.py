@@ -26,6 +26,7 @@ from splatseg.io.ply import PlyElement, PlyHeader, ply_header, ply_offsets, read
 from splatseg.io.splats._rows import (
     BLOCK,
     Filter,
+    Losses,
     Rows,
     blocks,
     finish,
@@ -406,13 +407,14 @@ def _restore(header: PlyHeader, columns: Mapping[str, np.ndarray]) -> dict[str, 
     return extra | left
 
 
-def write_ply(gaussians: Gaussians, path: Path) -> None:
+def write_ply(gaussians: Gaussians, path: Path, *, losses: Losses) -> None:
     """Write Gaussians and their extra columns as a binary little-endian PLY file.
 
     Raises:
         InputError: If an extra column has a name or a type that PLY cannot hold.
         RangeError: If a row cannot be rendered.
     """
+    del losses  # there are none
     rows = to_rows(gaussians)
     extra, notes = _flatten(gaussians.extra)
     count = rows.sh.shape[1] - 1

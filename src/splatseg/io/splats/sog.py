@@ -320,7 +320,7 @@ _MAX_SIDE = 16383
 _DATE = (1980, 1, 1, 0, 0, 0)
 
 
-def write_sog(gaussians: Gaussians, path: Path, losses: Losses) -> None:
+def write_sog(gaussians: Gaussians, path: Path, *, losses: Losses) -> None:
     """Write a bundled ``.sog`` file of version 2, rows in the order they have.
 
     Scales, colours and harmonics go by codebooks of 256 numbers; harmonics beyond the mean

@@ -71,7 +71,7 @@ def _fill(rows: Rows, part: slice, block: NDArray[np.void]) -> None:
     rows.opacities[part] = block["colour"][:, 3] / 255
 
 
-def write_splat(gaussians: Gaussians, path: Path, losses: Losses) -> None:
+def write_splat(gaussians: Gaussians, path: Path, *, losses: Losses) -> None:
     """Write a ``.splat`` file, rows in the order they have.
 
     Raises:

@@ -221,7 +221,7 @@ def _rotations(packed: NDArray[np.uint8], version: int) -> NDArray[np.float64]:
     return np.concatenate([w[:, None], xyz], axis=1)
 
 
-def write_spz(gaussians: Gaussians, path: Path, losses: Losses, *, version: Literal[3, 4]) -> None:
+def write_spz(gaussians: Gaussians, path: Path, *, losses: Losses, version: Literal[3, 4]) -> None:
     """Write an SPZ file of version 3 or 4, rows in the order they have.
 
     Positions get as many fractional bits as the largest coordinate leaves room for, up to
