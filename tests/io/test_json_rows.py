@@ -5,7 +5,7 @@ import json
 import pytest
 
 from splatseg.errors import FileFormatError, MissingFileError
-from splatseg.io.json_rows import read_json_rows
+from splatseg.io.json_files import read_json_rows
 
 
 def test_rows_of_json_come_one_by_one(tmp_path, monkeypatch) -> None:
@@ -13,7 +13,7 @@ def test_rows_of_json_come_one_by_one(tmp_path, monkeypatch) -> None:
     file = tmp_path / "a.json"
     rows = [{"text": 'a "]}, [{" \\ é', "n": [1, {"a": None}]}, {}, {"x": "😀" * 9}]
     for chunk in (1, 2, 3, 7, 1 << 20):
-        monkeypatch.setattr("splatseg.io.json_rows._CHUNK", chunk)
+        monkeypatch.setattr("splatseg.io.json_files._CHUNK", chunk)
         for indent in (None, 2):
             for ascii_only in (True, False):
                 text = json.dumps(rows, indent=indent, ensure_ascii=ascii_only)
@@ -35,8 +35,8 @@ def test_rows_of_broken_json(tmp_path, text) -> None:
 
 
 def test_a_row_without_an_end(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr("splatseg.io.json_rows._MAX_ROW", 100)
-    monkeypatch.setattr("splatseg.io.json_rows._CHUNK", 64)
+    monkeypatch.setattr("splatseg.io.json_files._MAX_ROW", 100)
+    monkeypatch.setattr("splatseg.io.json_files._CHUNK", 64)
     file = tmp_path / "a.json"
     file.write_text('[{"a": "' + "x" * 1000)
     with pytest.raises(FileFormatError, match="a row cannot be parsed"):

@@ -7,8 +7,15 @@ import pytest
 
 from splatseg.errors import FileFormatError, MissingFileError
 from splatseg.io.limits import unpacking
-from splatseg.io.parquet import RowReader, bytes_of, integer_of, list_of, number_of, read_rows
-from splatseg.io.parquet_footer import read_chunks
+from splatseg.io.parquet import (
+    RowReader,
+    bytes_of,
+    integer_of,
+    list_of,
+    number_of,
+    read_chunks,
+    read_rows,
+)
 
 
 @pytest.fixture
@@ -43,7 +50,7 @@ def test_values_of_a_row(file) -> None:
     assert bytes_of(rows[2], "bytes", where=file) == b"xx"
     assert rows[0]["fixed"] is None
     for call, words in (
-        (lambda: list_of(rows[0], "fixed", where=file), "expected numbers in fixed, got None"),
+        (lambda: list_of(rows[0], "fixed", where=file), "expected numbers in fixed, got none"),
         (lambda: list_of(rows[2], "lists", where=file, count=3), "expected 3 numbers in lists"),
         (lambda: bytes_of(rows[0], "bytes", where=file), "expected bytes in bytes"),
         (lambda: number_of(rows[0], "lists", where=file), "expected a number in lists"),

@@ -134,7 +134,7 @@ def test_a_second_run_reads_what_the_first_one_kept(
 
 def test_other_tools_find_their_own_model(result: PoseResult, kept: Path, room: Any) -> None:
     """sparse/0 is COLMAP's, in pixels of the upright photographs."""
-    from splatseg.io.captures.colmap import read_colmap_model
+    from splatseg.io.captures.colmap_model import read_colmap_model
 
     assert result.report.registered
     model = read_colmap_model(kept / "sparse" / "0")

@@ -7,6 +7,7 @@ the capture (``source_file_path`` and so on), so that they are found again when 
 
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
@@ -15,17 +16,11 @@ import torch
 
 from splatseg.core import Camera, View
 from splatseg.core.view_names import view_name_fault
-from splatseg.errors import FileFormatError, quoted
-from splatseg.io.captures.nerfstudio import (
-    LENS_KEYS,
-    MILLIMETRE,
-    frame_matrix,
-    lens_of,
-    number,
-    size_of,
-)
+from splatseg.errors import FileFormatError
+from splatseg.io.captures.nerfstudio import LENS_KEYS, Frame, frame_matrix, frames_of, lens_of
 from splatseg.io.captures.raw_views import checked_pose, opencv_from_opengl
 from splatseg.io.foreign import made_from
+from splatseg.io.schema import malformed
 
 _MODEL_NAMES = {
     "pinhole": "PINHOLE",
@@ -34,10 +29,22 @@ _MODEL_NAMES = {
     "mei": "MEI",
     "thin_prism_fisheye": "THIN_PRISM_FISHEYE",
 }
-_SIZES = ("camera_model", "w", "h", "fl_x", "fl_y", "cx", "cy")
-_LENS = (*_SIZES, "xi", *LENS_KEYS["opencv"], "sx1", "sy1")
+_SIZES = ("w", "h", "fl_x", "fl_y", "cx", "cy")
+_LENS = ("camera_model", *_SIZES, "xi", *LENS_KEYS["opencv"], "sx1", "sy1")
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 _FILES = {"image": "file_path", "mask": "mask_path", "depth": "depth_file_path"}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StoredFrame(Frame):
+    """A view of a scene, which may have no photograph."""
+
+    file_path: str | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
+    name: str
+    split: str
+    source_file_path: str | None = None
+    source_mask_path: str | None = None
+    source_depth_file_path: str | None = None
 
 
 def cameras_content(views: Sequence[View], *, folder: Path, source: Path | None) -> dict[str, Any]:
@@ -76,12 +83,9 @@ def views_from_content(
         FileFormatError: If an entry lacks or has the wrong type.
         InputError: If a pose or an intrinsic cannot be.
     """
-    frames = content.get("frames")
-    if not isinstance(frames, list):
-        raise FileFormatError(f"{path}: expected a list of frames, got none.")
     return tuple(
-        _view(content, frame, folder=folder, source=source, where=f"{path}: frames[{i}]")
-        for i, frame in enumerate(cast(list[object], frames))
+        _view(frame, folder=folder, source=source, where=f"{path}: frames[{i}]")
+        for i, frame in enumerate(frames_of(content, StoredFrame, where=path))
     )
 
 
@@ -119,80 +123,58 @@ def _frame(view: View, *, folder: Path, source: Path | None) -> dict[str, Any]:
             frame[f"source_{key}"] = below
     if view.depth is not None and view.depth_unit is not None:
         frame["depth_unit_scale_factor"] = view.depth_unit
-    frame |= {
-        "camera_model": _MODEL_NAMES[camera.model],
-        "w": camera.width,
-        "h": camera.height,
-    }
+    frame |= {"camera_model": _MODEL_NAMES[camera.model], "w": camera.width, "h": camera.height}
     frame |= {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
     frame |= dict(zip(LENS_KEYS.get(camera.model, ()), camera.distortion, strict=True))
     frame["transform_matrix"] = (world_from_cam @ _FLIP).tolist()
     return frame
 
 
-def _view(
-    content: Mapping[str, Any],
-    frame: object,
-    *,
-    folder: Path,
-    source: Path | None,
-    where: str,
-) -> View:
-    if not isinstance(frame, dict):
-        raise FileFormatError(f"{where}: expected an object, got {type(frame).__name__}.")
-    entry = cast(dict[str, Any], frame)
-    merged = {**content, **entry}
-    name, split = entry.get("name"), entry.get("split")
-    if not isinstance(name, str) or not isinstance(split, str):
-        raise FileFormatError(
-            f"{where}: expected a name and a split, got {quoted(name)} and {quoted(split)}."
-        )
-    fault = view_name_fault(name)
+def _view(frame: StoredFrame, *, folder: Path, source: Path | None, where: str) -> View:
+    fault = view_name_fault(frame.name)
     if fault is not None:
         raise FileFormatError(f"{where}: {fault}.")
-    files = {
-        field: _resolve(entry, key, folder=folder, source=source) for field, key in _FILES.items()
-    }
+    image, mask, depth = (_resolve(frame, key, folder, source) for key in _FILES.values())
     with made_from(where):
         return View(
-            name=name,
-            split=split,
-            camera=_camera(merged, entry, where=where),
-            image=files["image"],
-            mask=files["mask"],
-            depth=files["depth"],
-            depth_unit=number(merged, "depth_unit_scale_factor", MILLIMETRE, where=where)
-            if files["depth"]
-            else None,
+            name=frame.name,
+            split=frame.split,
+            camera=_camera(frame, where=where),
+            image=image,
+            mask=mask,
+            depth=depth,
+            depth_unit=frame.depth_unit_scale_factor if depth else None,
         )
 
 
-def _resolve(
-    frame: Mapping[str, Any], key: str, *, folder: Path, source: Path | None
-) -> Path | None:
-    name, below = frame.get(key), frame.get(f"source_{key}")
-    if source is not None and isinstance(below, str):
+def _resolve(frame: StoredFrame, key: str, folder: Path, source: Path | None) -> Path | None:
+    name, below = getattr(frame, key), getattr(frame, f"source_{key}")
+    if source is not None and below is not None:
         return source / below
-    if not isinstance(name, str):
-        return None
-    return Path(os.path.normpath(folder / name))
+    return None if name is None else Path(os.path.normpath(folder / name))
 
 
-def _camera(merged: Mapping[str, Any], frame: Mapping[str, Any], *, where: str) -> Camera:
-    model, distortion = lens_of(merged, where=where)
-    pinhole = merged.get("camera_model") == _MODEL_NAMES["pinhole"]
-    matrix = frame_matrix(frame, where=where)
-    pose = checked_pose(opencv_from_opengl(matrix), where=where)
-    width, height = size_of(merged, where=where)
+def _camera(frame: StoredFrame, *, where: str) -> Camera:
+    model, distortion = lens_of(frame, where=where)
+    pinhole = frame.camera_model == _MODEL_NAMES["pinhole"]
+    pose = checked_pose(opencv_from_opengl(frame_matrix(frame, where=where)), where=where)
+    w, h, fx, fy, cx, cy = (_needed(frame, key, where) for key in _SIZES)
     with made_from(where):
         return Camera(
-            width=width,
-            height=height,
-            fx=number(merged, "fl_x", None, where=where),
-            fy=number(merged, "fl_y", None, where=where),
-            cx=number(merged, "cx", None, where=where),
-            cy=number(merged, "cy", None, where=where),
+            width=int(w),
+            height=int(h),
+            fx=fx,
+            fy=fy,
+            cx=cx,
+            cy=cy,
             cam_from_world=torch.from_numpy(pose),
             model="pinhole" if pinhole else model,
             distortion=() if pinhole else distortion,
         )
+
+
+def _needed(frame: StoredFrame, key: str, where: str) -> float:
+    value = getattr(frame, key)
+    if value is None:
+        raise malformed(where, f"a number {key}, got none")
+    return value

@@ -29,7 +29,7 @@ from splatseg.core import (
     node_row,
 )
 from splatseg.core.boundary import boundary
-from splatseg.core.json_numbers import json_integer, json_number
+from splatseg.core.json_values import json_integer, json_number
 from splatseg.errors import FileFormatError, InputError, quoted, reason
 from splatseg.io.atomic import atomic_file
 from splatseg.io.foreign import made_from

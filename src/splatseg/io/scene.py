@@ -27,7 +27,7 @@ from typing import Any, cast
 
 from splatseg.core import Layer, Scene, View
 from splatseg.core.boundary import boundary
-from splatseg.core.json_numbers import json_integer, json_number
+from splatseg.core.json_values import json_integer, json_number
 from splatseg.errors import FileFormatError, InputError, MissingFileError, quoted
 from splatseg.io.atomic import atomic_folder, hidden_folder, is_vacant, sync, sync_tree
 from splatseg.io.cameras import (

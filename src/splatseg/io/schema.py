@@ -1,4 +1,4 @@
-"""What a file's JSON must look like, declared as dataclasses and held to them in one place.
+"""What a file must hold, declared once: JSON as dataclasses, arrays by shape and kind of number.
 
     @dataclass(frozen=True, slots=True)
     class Frame:
@@ -9,24 +9,129 @@
     frame = structured(value, Frame, where=f"{path}: frames[3]")
 
 Types, ranges, lengths and choices stand in the annotations (`msgspec.Meta`); fields without a
-default must be there, others in the file are left alone. Numbers are finite.
+default must be there, others in the file are left alone. Numbers are finite and at most
+`MAX_NUMBER`, unless their range has the extra `MAY_BE_INFINITE`; whole ones may be written 3.0.
 """
 
+import functools
 import re
-from collections.abc import Mapping, Sequence
-from typing import Any, TypeVar, cast
+import types
+import typing
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Annotated, Any, TypeVar, Union, cast
 
 import msgspec
+from msgspec import Meta
+from numpy.typing import NDArray
 
+from splatseg.core.json_values import MAX_NUMBER
 from splatseg.errors import FileFormatError, quoted
+from splatseg.io.json_files import read_json_value
 
 T = TypeVar("T")
+MAX_SIDE = 1 << 24
+"""Pixels a side of a picture that a file may speak of."""
+
+Side = Annotated[int, Meta(ge=1, le=MAX_SIDE)]
+Whole = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+"""A whole number of at least 0 that 64 bits hold, such as an id."""
+
+Name = Annotated[str, Meta(min_length=1)]
+
+_Check = Callable[[Any, str], None]
+_NOTHING = object()
+_MAX_WHOLE = 2**53
 _PLACE = re.compile(r"^(?P<what>.*?)(?: - at `(?:key in )?\$(?P<at>.*)`)?$", re.DOTALL)
 _STEP = re.compile(r"\.([^.\[]+)|\[(\d+|\.\.\.)\]")
 _MISSING = re.compile(r"^Object missing required field `(.*)`$")
+_WORDS = (
+    (r"Invalid enum value .*", "expected one of the words that are known"),
+    (r"Number out of range", "expected a number that can be held"),
+    (r" (of length )?>= (\d+)(\.0)?$", r" \1of at least \2"),
+    (r" (of length )?<= (\d+)(\.0)?$", r" \1of at most \2"),
+    (r" > (\d+)(\.0)?$", r" above \1"),
+    (r" < (\d+)(\.0)?$", r" below \1"),
+    ("of length of", "of length"),
+    ("`int`", "a whole number"),
+    (r"`(int \| )?float`", "a number"),
+    ("`str`", "text"),
+    ("`bool`", "true or false"),
+    ("`object`", "an object"),
+    ("`array`", "a list"),
+    (r"`([a-z]+) \| null`", r"`\1` or null"),
+)  # fmt: skip
+_TYPES = {
+    "int": "a whole number", "float": "a number", "str": "text", "bool": "true or false",
+    "object": "an object", "array": "a list", "null": "null",
+}  # fmt: skip
+_KINDS = {
+    "iuf": "numbers",
+    "iu": "whole numbers",
+    "f": "real numbers",
+    "b": "booleans",
+    "U": "text",
+}
 
 
-def structured(value: object, kind: type[T], *, where: str) -> T:
+def malformed(where: object, expected: str, got: object = _NOTHING) -> FileFormatError:
+    """The error of a file that holds something else: ``WHERE: expected EXPECTED, got GOT.``.
+
+    Args:
+        where: The file, and the place in it.
+        expected: What should be there, with ", got ..." where `got` is not passed.
+        got: What is there; None is "none".
+    """
+    came = "" if got is _NOTHING else f", got {'none' if got is None else quoted(got)}"
+    return FileFormatError(f"{where}: expected {expected}{came}.")
+
+
+def expect(holds: object, where: object, expected: str, got: object = _NOTHING) -> None:
+    """Raise `malformed` unless something holds."""
+    if not holds:
+        raise malformed(where, expected, got)
+
+
+def check_array(
+    where: object, name: str, array: NDArray[Any], shape: Sequence[object], kinds: str = "iuf"
+) -> NDArray[Any]:
+    """An array of a file, if it has a shape and a kind of number.
+
+    Args:
+        where: The file.
+        name: What the array is called.
+        array: It.
+        shape: Lengths of its axes; a word is any length, called so.
+        kinds: NumPy's letters of kinds of numbers.
+
+    Raises:
+        FileFormatError: If it has others.
+    """
+    fits = len(shape) == array.ndim and all(
+        isinstance(axis, str) or axis == length
+        for axis, length in zip(shape, array.shape, strict=True)
+    )
+    if not fits or array.dtype.kind not in kinds:
+        axes = ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "")
+        what = _KINDS.get(kinds, "numbers")
+        raise malformed(
+            where, f"{name} of shape ({axes}) in {what}, got {array.dtype} of {array.shape}"
+        )
+    return array
+
+
+def read_structured(path: Path, kind: type[T]) -> T:
+    """A JSON file as the declared type, see `structured`.
+
+    Raises:
+        MissingFileError: If there is no such file.
+        FileFormatError: If it is no JSON, or not of this form.
+    """
+    return structured(read_json_value(path), kind, where=path)
+
+
+def structured(value: object, kind: type[T], *, where: object) -> T:
     """A value of a file as the declared type.
 
     Args:
@@ -38,53 +143,158 @@ def structured(value: object, kind: type[T], *, where: str) -> T:
         FileFormatError: If it is not of this form, with the place, what is expected and what came.
     """
     try:
+        found = _converted(value, kind)
+    except msgspec.ValidationError as error:
+        raise FileFormatError(_sentence(value, kind, str(error), where)) from error
+    check = _finite(kind)
+    if check is not None:
+        check(found, str(where))
+    return found
+
+
+def _converted(value: object, kind: type[T]) -> T:
+    try:
         return msgspec.convert(value, kind)
     except msgspec.ValidationError as error:
-        raise FileFormatError(_sentence(value, str(error), where)) from error
+        if "got `float`" not in str(error):
+            raise
+    return msgspec.convert(_with_whole_numbers(value), kind)
 
 
-def _sentence(value: object, message: str, where: str) -> str:
+def _with_whole_numbers(value: Any) -> Any:
+    """The same with 3 for 3.0, which JSON does not tell apart."""
+    if isinstance(value, float) and value.is_integer() and abs(value) < _MAX_WHOLE:
+        return int(value)
+    if isinstance(value, dict):
+        return {k: _with_whole_numbers(v) for k, v in cast("dict[Any, Any]", value).items()}
+    if isinstance(value, list):
+        return [_with_whole_numbers(v) for v in cast("list[Any]", value)]
+    return value
+
+
+@functools.cache
+def _finite(kind: Any) -> _Check | None:
+    """What refuses numbers of a type that are NaN, infinite or too large; None without numbers."""
+    origin, args = typing.get_origin(kind), typing.get_args(kind)
+    if kind is float:
+        return _check_number
+    if origin is Annotated:
+        free = any(m.extra and m.extra.get("infinite") for m in args[1:] if hasattr(m, "extra"))
+        return None if free else _finite(args[0])
+    if origin in (Union, types.UnionType):
+        members = [(typing.get_origin(m) or m, _finite(m)) for m in map(_plain_type, args)]
+        known = [(cls, check) for cls, check in members if check is not None]
+        return functools.partial(_check_union, known) if known else None
+    if origin in (list, tuple, dict):
+        inner = next((check for arg in args if (check := _finite(arg)) is not None), None)
+        if inner is None:
+            return None
+        return _check_numbers if inner is _check_number else functools.partial(_check_items, inner)
+    return functools.partial(_check_fields, kind) if is_dataclass(kind) else None
+
+
+@functools.cache
+def _number_fields(kind: type[Any]) -> list[tuple[str, _Check]]:
+    hints = typing.get_type_hints(kind, include_extras=True)
+    return [(f.name, check) for f in fields(kind) if (check := _finite(hints[f.name]))]
+
+
+def _plain_type(kind: Any) -> Any:
+    return typing.get_args(kind)[0] if typing.get_origin(kind) is Annotated else kind
+
+
+def _check_number(value: float, where: str) -> None:
+    expect(abs(value) <= MAX_NUMBER, where, f"a finite number up to {MAX_NUMBER:g}", value)
+
+
+def _check_numbers(values: Any, where: str) -> None:
+    listed = values.values() if isinstance(values, dict) else values
+    if not all(abs(value) <= MAX_NUMBER for value in listed):
+        _check_items(_check_number, values, where)
+
+
+def _check_items(check: _Check, values: Any, where: str) -> None:
+    for key, value in values.items() if isinstance(values, dict) else enumerate(values):
+        check(value, f"{where}[{quoted(key)}]")
+
+
+def _check_fields(kind: type[Any], value: Any, where: str) -> None:
+    for name, check in _number_fields(kind):
+        check(getattr(value, name), f"{where}: {name}")
+
+
+def _check_union(members: Sequence[tuple[type, _Check]], value: Any, where: str) -> None:
+    for cls, check in members:
+        if isinstance(value, cls):
+            check(value, where)
+
+
+def _sentence(value: object, kind: type[Any], message: str, where: object) -> str:
     found = _PLACE.match(message)
     what, at = (found["what"], found["at"] or "") if found else (message, "")
-    place = f"{where}: {at.removeprefix('.')}" if at else where
+    steps = [name or index for name, index in _STEP.findall(at)]
+    if "..." in steps:
+        steps = _with_keys(value, kind, steps)
+    shown = "".join(f"[{s}]" if s.isdigit() else f".{s}" for s in steps).removeprefix(".")
+    place = f"{where}: {shown}" if shown else str(where)
     missing = _MISSING.match(what)
     if missing is not None:
         return f"{place}: expected a field {missing[1]}, got none."
-    what = _plain(what)
-    here = _found(value, at)
-    came = "" if here is None else f", got {here}"
-    return f"{place}: {what}{came}."
+    return f"{place}: {_in_our_words(what)}, got {_in_words(_at(value, steps))}."
 
 
-_WORDS = {
-    "`int`": "a whole number",
-    "`float`": "a number",
-    "`str`": "text",
-    "`bool`": "true or false",
-    "`object`": "an object",
-    "`array`": "a list",
-    "`null`": "null",
-    "`int | float`": "a number",
-}
+def _in_our_words(what: str) -> str:
+    """What msgspec says in the words of this library."""
+    what = re.sub(r"`([a-z]+(?: \| [a-z]+)+)`", _alternatives, what.split(", got ")[0])
+    for theirs, ours in _WORDS:
+        what = re.sub(theirs, ours, what)
+    return what[:1].lower() + what[1:]
 
 
-def _plain(what: str) -> str:
-    """What msgspec says in those of this library."""
-    what = what.split(", got ")[0]
-    for theirs, ours in _WORDS.items():
-        what = what.replace(theirs, ours)
-    return what[:1].lower() + what[1:].replace("`", "")
+def _alternatives(found: "re.Match[str]") -> str:
+    return " or ".join(dict.fromkeys(_TYPES.get(name, name) for name in found[1].split(" | ")))
 
 
-def _found(value: object, at: str) -> str | None:
-    """The value at a place of msgspec's (``.frames[3].w``), in words."""
-    for name, index in _STEP.findall(at):
-        if name and isinstance(value, Mapping):
-            value = cast("Mapping[str, Any]", value).get(name)
-        elif index.isdigit() and isinstance(value, Sequence) and not isinstance(value, str):
-            value = cast("Sequence[Any]", value)[int(index)]
-        else:
-            return None
-    if isinstance(value, (bool, int, float, str)) or value is None:
-        return quoted(value)
-    return f"{'an object' if isinstance(value, Mapping) else 'a list'} of {len(cast('Any', value))}"
+def _in_words(value: object) -> str:
+    if isinstance(value, Mapping):
+        return f"an object of {len(cast('Any', value))}"
+    if isinstance(value, list):
+        return f"a list of {len(cast('Any', value))}"
+    return quoted(value)
+
+
+def _at(value: Any, steps: Sequence[str]) -> Any:
+    """The value at a place."""
+    for step in steps:
+        value = value[int(step)] if isinstance(value, list) else value[step]
+    return value
+
+
+def _with_keys(value: Any, kind: type[Any], steps: Sequence[str]) -> list[str]:
+    """A place of msgspec's, which does not tell keys of mappings, with the first that is wrong."""
+    index = steps.index("...")
+    before = steps[:index]
+    keys = list(_at(value, before))
+    while len(keys) > 1:
+        half = keys[: len(keys) // 2]
+        keys = half if _fails(_with_only(value, before, half), kind) else keys[len(half) :]
+    found = [*before, keys[0], *steps[index + 1 :]]
+    return _with_keys(value, kind, found) if "..." in found else found
+
+
+def _fails(value: object, kind: type[Any]) -> bool:
+    try:
+        _converted(value, kind)
+    except msgspec.ValidationError:
+        return True
+    return False
+
+
+def _with_only(value: Any, steps: Sequence[str], keys: Sequence[str]) -> Any:
+    """The value with some keys alone in the mapping at a place."""
+    if not steps:
+        return {key: value[key] for key in keys}
+    copied: Any = value.copy()
+    step: Any = int(steps[0]) if isinstance(value, list) else steps[0]
+    copied[step] = _with_only(value[step], steps[1:], keys)
+    return copied

@@ -10,7 +10,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from splatseg.core.json_numbers import json_integer
+from splatseg.core.json_values import json_integer
 from splatseg.errors import FileFormatError, InputError, MissingFileError, quoted
 from splatseg.io.foreign import read_bytes, reading
 from splatseg.io.json_files import parse_object

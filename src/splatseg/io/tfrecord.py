@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from splatseg.errors import FileFormatError
 from splatseg.io.foreign import reading
+from splatseg.io.schema import expect, malformed
 
 _POLYNOMIAL = 0x82F63B78
 _MASK = 0xA282EAD8
@@ -47,24 +47,20 @@ def read_records(path: Path) -> Iterator[bytes]:
                 head = stream.read(_HEAD.size)
             if not head:
                 return
-            if len(head) < _HEAD.size:
-                raise FileFormatError(f"{where}: expected a whole record, but the file ends early.")
+            whole = "a whole record, but the file ends early"
+            expect(len(head) == _HEAD.size, where, whole)
             length, check = _HEAD.unpack(head)
-            if masked_crc32c(head[:8]) != check:
-                raise FileFormatError(
-                    f"{where}: expected the checksum of its length, got another; the file is "
-                    "damaged, or no TFRecord file."
-                )
-            if length > size - stream.tell() - 4:
-                raise FileFormatError(f"{where}: expected a whole record, but the file ends early.")
+            expect(
+                masked_crc32c(head[:8]) == check,
+                where,
+                "the checksum of its length, got another; the file is damaged, or no TFRecord file",
+            )
+            expect(length <= size - stream.tell() - 4, where, whole)
             with reading(path, "a TFRecord file"):
                 content = stream.read(length)
                 (check,) = struct.unpack("<I", stream.read(4))
-            if masked_crc32c(content) != check:
-                raise FileFormatError(
-                    f"{where}: expected the checksum of its {length} bytes, got another; the file "
-                    "is damaged."
-                )
+            what = f"the checksum of its {length} bytes, got another; the file is damaged"
+            expect(masked_crc32c(content) == check, where, what)
             yield content
             number += 1
 
@@ -124,15 +120,11 @@ def parse_message(content: bytes, *, where: object) -> Message:
         value: Value
         if kind == 0:
             value, at = _varint(content, at, where)
-        elif kind in (1, 2, 5):
-            length = {1: 8, 5: 4}.get(kind)
-            if length is None:
-                length, at = _varint(content, at, where)
-            if length > end - at:
-                raise FileFormatError(f"{where}: expected a whole message, but it ends early.")
-            value, at = content[at : at + length], at + length
         else:
-            raise FileFormatError(f"{where}: expected a message, got a field of kind {kind}.")
+            expect(kind in (1, 2, 5), where, f"a message, got a field of kind {kind}")
+            length, at = _varint(content, at, where) if kind == 2 else (8 if kind == 1 else 4, at)
+            expect(length <= end - at, where, "a whole message, but it ends early")
+            value, at = content[at : at + length], at + length
         fields.setdefault(key >> 3, []).append(value)
     return fields
 
@@ -147,12 +139,11 @@ def packed_integers(content: bytes, *, where: object) -> NDArray[np.int64]:
     ends = np.flatnonzero(raw < 128)
     if not raw.size:
         return np.zeros(0, np.int64)
-    if not ends.size or ends[-1] != len(raw) - 1:
-        raise FileFormatError(f"{where}: expected whole numbers, but the last ends early.")
+    whole = ends.size and ends[-1] == len(raw) - 1
+    expect(whole, where, "whole numbers, but the last ends early")
     starts = np.concatenate(([0], ends[:-1] + 1))
     lengths = ends - starts + 1
-    if lengths.max() > 10:
-        raise FileFormatError(f"{where}: expected numbers of 64 bits, got longer ones.")
+    expect(lengths.max() <= 10, where, "numbers of 64 bits, got longer ones")
     values = np.zeros(len(ends), np.uint64)
     for i in range(int(lengths.max())):
         has = lengths > i
@@ -170,7 +161,7 @@ def _varint(content: bytes, at: int, where: object) -> tuple[int, int]:
         if byte < 128:
             return value, at
         shift += 7
-    raise FileFormatError(f"{where}: expected a whole message, but a number in it is damaged.")
+    raise malformed(where, "a whole message, but a number in it is damaged")
 
 
 @cache

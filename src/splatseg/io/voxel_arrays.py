@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splatseg.core import LayerInfo, StoredTable, VoxelFeatures, VoxelGrid
-from splatseg.core.json_numbers import json_integer, json_number
+from splatseg.core.json_values import json_integer, json_number
 from splatseg.errors import FileFormatError, quoted
 from splatseg.io.layer_arrays import checked_array
 

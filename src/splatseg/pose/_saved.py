@@ -23,7 +23,7 @@ from splatseg.core import Capture
 from splatseg.core.boundary import boundary
 from splatseg.errors import FileFormatError, InputError, quoted
 from splatseg.io.captures.build import build_capture
-from splatseg.io.captures.colmap import read_colmap_model
+from splatseg.io.captures.colmap_model import read_colmap_model
 from splatseg.io.captures.colmap_model import intrinsics_of, poses_of
 from splatseg.io.captures.raw_views import RawView
 from splatseg.io.json_files import read_json, write_json

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from splatseg.core import LayerInfo, RenderableLayer, layer_info_from_json, layer_info_to_json
 from splatseg.core.boundary import boundary
-from splatseg.core.json_numbers import json_integer, json_number
+from splatseg.core.json_values import json_integer, json_number
 from splatseg.errors import FileFormatError, quoted
 from splatseg.io.foreign import made_from
 from splatseg.io.json_files import json_text, parse_object

@@ -8,8 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splatseg.core.json_numbers import json_number
-from splatseg.core.json_values import id_of_key
+from splatseg.core.json_values import id_of_key, json_number
 from splatseg.errors import FileFormatError, quoted
 from splatseg.evaluate import (
     BinaryReport,

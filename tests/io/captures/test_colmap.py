@@ -14,9 +14,13 @@ import torch
 from splatseg.core import Camera
 from splatseg.errors import FileFormatError, InputError, MissingFileError, MissingPackageError
 from splatseg.io.captures import read_capture
-from splatseg.io.captures._colmap_text import read_frames
-from splatseg.io.captures.colmap import read_colmap_model
-from splatseg.io.captures.colmap_model import MODELS, ColmapCamera, intrinsics_of
+from splatseg.io.captures.colmap_model import (
+    MODELS,
+    ColmapCamera,
+    intrinsics_of,
+    read_colmap_model,
+    read_records,
+)
 
 WIDTH, HEIGHT = 64, 48
 
@@ -131,7 +135,10 @@ def test_models_that_colmap_has_not_are_refused_by_name() -> None:
 @pytest.mark.parametrize("name", UNDISTORTABLE)
 def test_models_of_ours_are_read(name) -> None:
     raw = ColmapCamera(
-        model=name, width=8, height=8, parameters=(4.0,) * dict(MODELS.values())[name]
+        model=name,
+        width=8,
+        height=8,
+        parameters=(4.0,) * next(lens.parameters for lens in MODELS if lens.name == name),
     )
     assert intrinsics_of(raw, where="x").width == 8
 
@@ -232,10 +239,10 @@ def test_impossible_frames_are_refused(rig_capture, change, message) -> None:
 def test_a_frame_with_fewer_images_than_it_says_is_refused_at_once(tmp_path, count) -> None:
     path = tmp_path / "frames.txt"
     path.write_text("# comment\n1 1 1 0 0 0 0 0 0 2 CAMERA 1 11 CAMERA 2 12\n")
-    assert read_frames(path)[0].images == ((1, 11), (2, 12))
+    assert next(read_records(path)).images == ((1, 11), (2, 12))
     path.write_text(path.read_text().replace("0 2 CAMERA", f"0 {count} CAMERA"))
     with pytest.raises(FileFormatError, match=r"frames\.txt: line 2: expected FRAME_ID"):
-        read_frames(path)
+        list(read_records(path))
 
 
 def test_a_zero_quaternion_is_no_pose(rig_capture) -> None:

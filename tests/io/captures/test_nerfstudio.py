@@ -159,17 +159,17 @@ def test_photographs_of_a_uniform_scale_are_taken_and_it_is_said(nerfstudio) -> 
         ({"w": 100}, "expected a photograph of 100x48 pixels or a uniform scale"),
         ({"w": HEIGHT, "h": WIDTH}, "turned by its EXIF orientation, perhaps"),
         ({"w": 2 * WIDTH, "h": 2 * HEIGHT + 7}, "expected a photograph of 128x103 pixels"),
-        ({"fl_x": math.inf}, "fl_x: expected a finite number, got inf"),
+        ({"fl_x": math.inf}, "fl_x: expected a finite number up to .*, got inf"),
         ({"fl_x": 0}, "positive focal length, got fx = 0"),
         ({"fl_y": -3}, "positive focal length, got fy = -3"),
-        ({"cx": "left"}, "cx: expected a finite number, got 'left'"),
+        ({"cx": "left"}, "cx: expected a number or null, got 'left'"),
         (
             {"fl_x": None, "fl_y": None},
             "expected a focal length .fl_x, camera_angle_x or x_fov., got none",
         ),
         ({"camera_model": "EQUIRECTANGULAR"}, "got 'EQUIRECTANGULAR'"),
         ({"ply_file_path": "gone.ply"}, r"transforms.json: the start points .* \('gone.ply'\)"),
-        ({"k1": float("nan")}, "k1: expected a finite number, got nan"),
+        ({"k1": float("nan")}, "k1: expected a finite number up to .*, got nan"),
     ],
 )
 def test_impossible_intrinsics_are_refused(nerfstudio, top, message) -> None:
@@ -238,7 +238,7 @@ def test_a_rotation_written_with_few_digits_is_made_exact(nerfstudio) -> None:
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"frames": 3}', '{"frames": [{}]}', "\xff"])
 def test_what_is_no_transforms_json_is_refused(tmp_path, text) -> None:
     (tmp_path / "transforms.json").write_text(text, encoding="latin-1")
-    with pytest.raises(FileFormatError, match=r"transforms\.json: expected"):
+    with pytest.raises(FileFormatError, match=r"transforms\.json: .*expected"):
         read_capture(tmp_path)
 
 

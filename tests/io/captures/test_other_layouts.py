@@ -8,8 +8,8 @@ import torch
 
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.io.captures import bare_photographs, find_formats, read_capture
-from splatseg.io.captures._points import read_ply_points
 from splatseg.io.captures.idr import decompose
+from splatseg.io.captures.points import read_ply_points
 from support.layouts import write_idr, write_llff
 
 
@@ -38,7 +38,7 @@ def test_llff_axes_and_scale(tmp_path, write_image) -> None:
     ("rows", "message"),
     [
         (np.zeros((2, 17)), "expected one row a photograph, got 2 rows for 1"),
-        (np.zeros((1, 15)), r"shape \(n, 17\), got \(1, 15\)"),
+        (np.zeros((1, 15)), r"shape \(n, 17\) in numbers, got float64 of \(1, 15\)"),
         (np.zeros((1, 17)), "expected a height and width"),
     ],
 )

@@ -74,7 +74,7 @@ def test_another_camera_of_replica(place, tmp_path, write_image) -> None:
     camera = read_capture(tmp_path).views[0].camera
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (100, 105, 30, 25)
     path.write_text("{}")
-    with pytest.raises(FileFormatError, match=r"cam_params.json: expected an object camera"):
+    with pytest.raises(FileFormatError, match=r"cam_params.json: expected a field camera"):
         read_capture(tmp_path)
     path.write_text('{"camera": {"w": -1}}')
     with pytest.raises(FileFormatError, match=r"cam_params.json: camera.w: expected a finite numb"):
@@ -249,9 +249,9 @@ def test_frames_of_scannetpp(fisheye_scene, tmp_path, write_image) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda c: c.pop("frames"), "expected a list of frames, got None"),
+        (lambda c: c.pop("frames"), "expected a list of frames, got none"),
         (lambda c: c.update(test_frames=5), "expected a list of test_frames, got 5"),
-        (lambda c: c["frames"][2].pop("file_path"), r"expected a file_path in frames\[2\]"),
+        (lambda c: c["frames"][2].pop("file_path"), r"frames\[2\]: expected a field file_path"),
         (lambda c: c["test_frames"][0].pop("transform_matrix"), "expected 4 x 4 or 3 x 4 numbers"),
     ],
 )
@@ -264,7 +264,7 @@ def test_scannetpp_files_that_cannot_be(change, message, fisheye_scene, tmp_path
 def test_lists_that_cannot_be(fisheye_scene, tmp_path) -> None:
     scene = edited(fisheye_scene, tmp_path, lambda content: None)
     (scene / "dslr/train_test_lists.json").write_text('{"train": 3}')
-    with pytest.raises(FileFormatError, match=r"lists.json: expected a list train, got 3"):
+    with pytest.raises(FileFormatError, match=r"lists.json: train: expected a list, got 3"):
         read_capture(scene)
 
 

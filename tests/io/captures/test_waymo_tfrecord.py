@@ -106,7 +106,7 @@ def test_a_file_that_is_cut_short(tmp_path, cut) -> None:
         (field(2, 7) + field(3, field(1, b"abc")), "numbers of 8 bytes, got 3"),
         (field(2, 7) + field(5, field(1, 1) + field(2, field(2, b"x"))), "a range image, but"),
         (field(2, 7) + field(5, field(2, field(2, zlib.compress(b""))) + field(1, 1)), "of three"),
-        (field(2, 7) + field(1, field(2, b"")), "9 numbers of a lens, got 0"),
+        (field(2, 7) + field(1, field(2, field(1, 1))), "9 numbers of a lens, got 0"),
     ],
 )  # fmt: skip
 def test_frames_that_are_none(tmp_path, record, words) -> None:

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from splatseg.errors import InputError, MissingPackageError, RangeError
-from splatseg.io.captures._points import read_ply_points
+from splatseg.io.captures.points import read_ply_points
 from splatseg.io.export import write_points
 
 

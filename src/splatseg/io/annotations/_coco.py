@@ -19,7 +19,7 @@ from typing import Any, cast
 import numpy as np
 
 from splatseg.core import ClassInfo, ClassTable
-from splatseg.core.json_numbers import json_integer, json_number
+from splatseg.core.json_values import json_integer, json_number
 from splatseg.errors import FileFormatError, quoted
 from splatseg.io.annotations._base import AnnotatedPicture, Annotations, renumbered
 from splatseg.io.annotations._regions import Canvas, Region, corners_of

@@ -17,7 +17,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from splatseg.core.json_numbers import is_json_number, json_integer
+from splatseg.core.json_values import is_json_number, json_integer
 from splatseg.errors import FileFormatError, quoted
 from splatseg.io.annotations._base import AnnotatedPicture, Annotations, classes_of_names
 from splatseg.io.annotations._regions import Canvas, Region, corners_of

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from splatseg.core.json_numbers import json_integer
+from splatseg.core.json_values import json_integer
 from splatseg.errors import FileFormatError, quoted, reason
 from splatseg.io.annotations._base import AnnotatedPicture, Annotations, classes_of_names
 from splatseg.io.annotations._names import parts_of

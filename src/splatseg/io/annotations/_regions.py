@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatseg.core import Rle
-from splatseg.core.json_numbers import is_json_number
+from splatseg.core.json_values import is_json_number
 from splatseg.errors import FileFormatError, InputError, quoted
 from splatseg.io.limits import check_unpacked
 

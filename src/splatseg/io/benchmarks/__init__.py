@@ -30,7 +30,7 @@ from splatseg.io.benchmarks.scannet import find_scannet_scenes, read_scannet_sce
 from splatseg.io.benchmarks.scannetpp import find_scannetpp_scenes, read_scannetpp_scenes
 from splatseg.io.benchmarks.spin_nerf import find_spin_nerf, read_spin_nerf
 from splatseg.io.benchmarks.waymo import find_waymo_scenes, read_waymo_scenes
-from splatseg.io.captures.kitti360_drive import window_of
+from splatseg.io.captures.kitti360 import window_of
 
 
 @dataclass(frozen=True, slots=True)

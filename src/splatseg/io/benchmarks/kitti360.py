@@ -30,14 +30,14 @@ from splatseg.core import (
 from splatseg.errors import FileFormatError, InputError, MissingFileError, quoted
 from splatseg.io.benchmarks._masks import check_proportions, true_ids
 from splatseg.io.benchmarks._views import read_views
-from splatseg.io.captures.kitti360 import static_windows
-from splatseg.io.captures.kitti360_drive import (
+from splatseg.io.captures.kitti360 import (
     ACCUMULATED,
     PHOTOGRAPHS,
     SEMANTICS,
     Drive,
     drives,
     find_drive,
+    static_windows,
     window_name,
     window_of,
 )

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splatseg.core import BenchmarkScene, TargetTask, TrueMask
-from splatseg.core.json_numbers import json_integer, json_number
+from splatseg.core.json_values import json_integer, json_number
 from splatseg.errors import FileFormatError, MissingFileError, quoted
 from splatseg.io.benchmarks._masks import check_proportions
 from splatseg.io.benchmarks._views import ViewsByFile, read_views, trained_on_all

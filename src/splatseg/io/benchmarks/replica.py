@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any, cast
 
 from splatseg.core import BenchmarkScene, Capture, ClassInfo, ClassTable, TrueMaps, View
-from splatseg.core.json_numbers import json_integer
+from splatseg.core.json_values import json_integer
 from splatseg.errors import FileFormatError, InputError, MissingFileError, quoted
 from splatseg.io.benchmarks._masks import true_ids
 from splatseg.io.benchmarks._views import ViewsByFile, read_views, scene_folders, split_by
 from splatseg.io.captures import find_formats
-from splatseg.io.captures.replica import SEQUENCE, find_replica
+from splatseg.io.captures.pose_tables import SEQUENCE, find_replica
 from splatseg.io.foreign import made_from
 from splatseg.io.images import find_images
 from splatseg.io.json_files import read_json
@@ -46,7 +46,7 @@ def find_grouping_replica(folder: Path) -> tuple[Path, ...]:
 def read_replica_scenes(folder: Path, *, sequence: str | None = None) -> tuple[BenchmarkScene, ...]:
     """Read scenes with classes and instances of every pixel.
 
-    A scene is a sequence (see `io.captures.replica`), or has it in its folder, with
+    A scene is a sequence (see `io.captures.pose_tables`), or has it in its folder, with
     ``semantic_class/semantic_class_N.png`` and ``semantic_instance/semantic_instance_N.png``;
     0 is none. Names come from Replica's ``info_semantic.json`` in the scene or in
     ``semantic_info/SCENE`` beside it, where it is there.

@@ -23,7 +23,7 @@ from splatseg.core import (
 from splatseg.errors import FileFormatError, MissingFileError, quoted
 from splatseg.io.benchmarks._masks import true_ids
 from splatseg.io.benchmarks._views import read_views, scene_folders, trained_on_all
-from splatseg.io.captures.scannet import find_scannet, labelled_mesh
+from splatseg.io.captures.pose_tables import find_scannet, labelled_mesh
 from splatseg.io.foreign import is_file, read_lines
 from splatseg.io.ply_vertices import read_ply_vertices, vertex_positions
 

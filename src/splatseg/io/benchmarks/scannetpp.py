@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from splatseg.core import UNLABELLED, BenchmarkScene, ClassInfo, ClassTable, Labels, TruePoints
 from splatseg.errors import FileFormatError, MissingFileError, quoted
 from splatseg.io.benchmarks._views import read_views, scene_folders
-from splatseg.io.captures.scannetpp import find_scannetpp
+from splatseg.io.captures.nerfstudio import find_scannetpp
 from splatseg.io.foreign import made_from, reading
 from splatseg.io.json_files import read_json
 from splatseg.io.ply_vertices import read_ply_vertices, vertex_positions

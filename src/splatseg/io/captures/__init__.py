@@ -1,42 +1,85 @@
 """Captures: posed photographs in the layouts people have, read without their pixels.
 
-One module a layout; `read_capture` finds out which. Where a folder has several descriptions
-the first of `FORMATS` wins.
+`LAYOUTS` is the table of them; `read_capture` finds out which. Where a folder has several
+descriptions the first of the table wins. A layout more is a row more.
 """
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple, Protocol
 
 from splatseg._check import check_choice
 from splatseg.core import Capture, PointCloud
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, MissingFileError
-from splatseg.io.captures._metadata import Metadata as Metadata
-from splatseg.io.captures._metadata import read_metadata as read_metadata
-from splatseg.io.captures._points import read_ply_points
-from splatseg.io.captures.blender import find_blender, read_blender
-from splatseg.io.captures.build import finite_points
 from splatseg.io.captures.colmap import find_colmap, read_colmap
-from splatseg.io.captures.idr import FILES as _IDR_FILES
+from splatseg.io.captures.idr import FILES as IDR_FILES
 from splatseg.io.captures.idr import find_idr, read_idr
 from splatseg.io.captures.kitti360 import find_kitti360, read_kitti360
-from splatseg.io.captures.llff import FILE as _LLFF_FILE
-from splatseg.io.captures.llff import read_llff
-from splatseg.io.captures.nerfstudio import FILE as _NERFSTUDIO_FILE
-from splatseg.io.captures.nerfstudio import read_nerfstudio
-from splatseg.io.captures.replica import FILE as _REPLICA_FILE
-from splatseg.io.captures.replica import find_replica, read_replica
-from splatseg.io.captures.scannet import find_scannet, read_scannet
-from splatseg.io.captures.scannetpp import find_scannetpp, read_scannetpp
+from splatseg.io.captures.nerfstudio import (
+    BLENDER_FILE,
+    FILE,
+    find_scannetpp,
+    read_blender,
+    read_nerfstudio,
+    read_scannetpp,
+)
+from splatseg.io.captures.points import Metadata as Metadata
+from splatseg.io.captures.points import finite_points, read_ply_points
+from splatseg.io.captures.points import read_metadata as read_metadata
+from splatseg.io.captures.pose_tables import (
+    LLFF_FILE,
+    REPLICA_FILE,
+    find_replica,
+    find_scannet,
+    read_llff,
+    read_replica,
+    read_scannet,
+)
 from splatseg.io.captures.waymo import find_waymo, read_waymo
 from splatseg.io.captures.waymo_segment import SUFFIX as _WAYMO_SUFFIX
 from splatseg.io.captures.waymo_tfrecord import ENDING as _TFRECORD
 from splatseg.io.images import find_images
 
-FORMATS = (
-    "nerfstudio", "blender", "colmap", "llff", "idr", "replica", "scannet", "scannetpp", "kitti360",
-    "waymo",
-)  # fmt: skip
+
+class Reader(Protocol):
+    """Reads a capture of one layout."""
+
+    def __call__(self, path: Path, /, *, strict: bool) -> Capture:
+        """The capture at a path."""
+        ...
+
+
+class Layout(NamedTuple):
+    """How captures of a layout are found and read."""
+
+    name: str
+    find: Callable[[Path], object]
+    """Whether a folder is one: anything that counts as true."""
+
+    read: Reader
+    files: tuple[str, ...] = ()
+    """Names of files, beside others of the capture, that may stand for its folder."""
+
+    suffixes: tuple[str, ...] = ()
+    """Of files that are captures by themselves."""
+
+
+LAYOUTS = (
+    Layout("nerfstudio", lambda path: (path / FILE).is_file(), read_nerfstudio, (FILE,)),
+    Layout("blender", lambda path: (path / BLENDER_FILE).is_file(), read_blender, (BLENDER_FILE,)),
+    Layout("colmap", find_colmap, read_colmap),
+    Layout("llff", lambda path: (path / LLFF_FILE).is_file(), read_llff, (LLFF_FILE,)),
+    Layout("idr", find_idr, read_idr, IDR_FILES),
+    Layout("replica", find_replica, read_replica, (REPLICA_FILE,)),
+    Layout("scannet", find_scannet, read_scannet),
+    Layout("scannetpp", find_scannetpp, read_scannetpp),
+    Layout("kitti360", find_kitti360, read_kitti360),
+    Layout("waymo", find_waymo, read_waymo, suffixes=(_WAYMO_SUFFIX, _TFRECORD)),
+)
 """Layouts that are read, in the order in which they are looked for."""
+
+FORMATS = tuple(layout.name for layout in LAYOUTS)
 
 
 @boundary
@@ -56,7 +99,7 @@ def read_capture(path: Path | str, *, format: str = "auto", strict: bool = False
         path: The capture's folder, or its transforms.json, poses_bounds.npy,
             cameras_sphere.npz or traj_w_c.txt, the folder of a COLMAP model, a component of a
             segment of Waymo, or of KITTI-360 a drive, a camera or a window of frames of one
-            (see `kitti360_drive`).
+            (see `io.captures.kitti360`).
         format: One of `FORMATS`, or ``auto`` for the first of them that is found.
         strict: Refuse a capture of which a photograph or a start point would be left out, or
             whose ``ply_file_path`` is not there.
@@ -80,31 +123,11 @@ def read_capture(path: Path | str, *, format: str = "auto", strict: bool = False
     if not folder.is_dir() and format != "waymo" and not window:
         raise MissingFileError(f"{path}: there is no such capture.")
     if format == "auto":
-        found = find_formats(folder)
-        if not found:
-            raise InputError(_nothing_found(folder))
-        format = found[0]
-    match format:
-        case "nerfstudio":
-            return read_nerfstudio(folder, strict=strict)
-        case "blender":
-            return read_blender(folder, strict=strict)
-        case "colmap":
-            return read_colmap(folder, strict=strict)
-        case "llff":
-            return read_llff(folder, strict=strict)
-        case "idr":
-            return read_idr(folder, strict=strict)
-        case "replica":
-            return read_replica(folder, strict=strict)
-        case "scannet":
-            return read_scannet(folder, strict=strict)
-        case "waymo":
-            return read_waymo(folder, strict=strict)
-        case "scannetpp":
-            return read_scannetpp(folder, strict=strict)
-        case _:
-            return read_kitti360(folder, strict=strict)
+        format = next(iter(find_formats(folder)), "")
+    layout = next((layout for layout in LAYOUTS if layout.name == format), None)
+    if layout is None:
+        raise InputError(_nothing_found(folder))
+    return layout.read(folder, strict=strict)
 
 
 @boundary
@@ -128,19 +151,7 @@ def read_start_points(
 @boundary
 def find_formats(folder: Path) -> tuple[str, ...]:
     """Layouts that a folder has, the one that would be read first."""
-    found = {
-        "nerfstudio": (folder / _NERFSTUDIO_FILE).is_file(),
-        "blender": find_blender(folder),
-        "colmap": find_colmap(folder) is not None,
-        "llff": (folder / _LLFF_FILE).is_file(),
-        "idr": find_idr(folder) is not None,
-        "replica": find_replica(folder) is not None,
-        "scannet": find_scannet(folder),
-        "scannetpp": find_scannetpp(folder),
-        "kitti360": find_kitti360(folder),
-        "waymo": find_waymo(folder),
-    }
-    return tuple(format for format in FORMATS if found[format])
+    return tuple(layout.name for layout in LAYOUTS if layout.find(folder))
 
 
 @boundary
@@ -150,13 +161,13 @@ def bare_photographs(folder: Path) -> tuple[Path, ...]:
 
 
 def _from_file(path: Path) -> tuple[Path, str]:
-    if path.suffix in (_WAYMO_SUFFIX, _TFRECORD):
-        return path, "waymo"
-    named = {_NERFSTUDIO_FILE: "nerfstudio", "transforms_train.json": "blender"}
-    named |= {_LLFF_FILE: "llff", _REPLICA_FILE: "replica"} | dict.fromkeys(_IDR_FILES, "idr")
-    if path.name not in named:
-        raise InputError(f"{path}: expected a capture's folder or one of {', '.join(named)}.")
-    return path.parent, named[path.name]
+    for layout in LAYOUTS:
+        if path.suffix in layout.suffixes:
+            return path, layout.name
+        if path.name in layout.files:
+            return path.parent, layout.name
+    known = ", ".join(file for layout in LAYOUTS for file in layout.files)
+    raise InputError(f"{path}: expected a capture's folder or one of {known}.")
 
 
 def _nothing_found(folder: Path) -> str:

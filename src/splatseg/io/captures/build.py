@@ -5,26 +5,25 @@ missing photographs, sizes and poses are dealt with here, once, so that every la
 the same mistakes in the same words.
 """
 
+import unicodedata
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path, PurePosixPath
-
-import torch
 
 from splatseg.core import Camera, Capture, PointCloud, View
 from splatseg.core.view_names import clean_view_names
 from splatseg.errors import InputError, MissingFileError, quoted
-from splatseg.io.captures._metadata import read_metadata
-from splatseg.io.captures._photographs import Photographs, moves
+from splatseg.io.captures.points import finite_points, read_metadata
 from splatseg.io.captures.raw_views import (
     RawView,
     camera_of,
     intrinsics_of_size,
     scaled_to,
 )
-from splatseg.io.foreign import is_file, made_from
-from splatseg.io.images import DEFAULT_LONGEST, image_size, reduced_size, same_shape
+from splatseg.io.foreign import is_file, is_folder, made_from
+from splatseg.io.images import DEFAULT_LONGEST, IMAGE_SUFFIXES, image_size, reduced_size, same_shape
 from splatseg.io.paths import check_utf8
 
 TEST_EVERY = 8
@@ -41,6 +40,111 @@ MIN_THERE = 0.5
 _NAMED = 20
 
 
+# Photographs are not always where a capture says. Blender and instant-ngp leave the suffix out,
+# converters change it, Windows does not mind case and macOS decomposes accents; paths are those of
+# the machine that a capture was made on, and what makes smaller copies puts them beside the folder
+# under its name with a number, as in ``images_4``.
+SMALLER = (2, 4, 8)
+"""Numbers of the folders of smaller copies: pixels of the photograph for one of a copy."""
+
+_FIRST = (".png", ".jpg", ".jpeg")
+_FOLDERS = ("", "images", "input", "rgb")
+_DEEPEST = 16
+"""Folders that may be left out of the front of a path."""
+
+
+class Photographs:
+    """Finds photographs by their path, or by their stem in the same folder."""
+
+    def __init__(self) -> None:
+        self._by_stem: dict[Path, dict[str, list[Path]]] = {}
+
+    def find(self, listed: Path) -> Path | None:
+        """The photograph of a path that a capture lists, None where there is none."""
+        if is_file(listed):
+            return listed
+        stems = self._stems(listed.parent)
+        found = stems.get(_key(listed.name), [])
+        suffix = listed.suffix[1:]
+        if not found and suffix.isalnum() and not suffix.isdigit():
+            found = stems.get(_key(listed.stem), [])
+        own = (listed.name, listed.stem)
+        return min(found, key=lambda file: (file.stem not in own, *_rank(file)), default=None)
+
+    def find_all(self, listed: Sequence[Path]) -> list[Path | None]:
+        """The photograph of each path; no file is that of two of them."""
+        named = {path for path in listed if is_file(path)}
+        found: list[Path | None] = []
+        for path in listed:
+            file = self.find(path)
+            if file is not None and file != path:
+                file = None if file in named else file
+                named |= set() if file is None else {file}
+            found.append(file)
+        return found
+
+    def count(self, listed: Iterable[Path]) -> int:
+        """How many of these are there."""
+        return sum(self.find(path) is not None for path in listed)
+
+    def _stems(self, folder: Path) -> dict[str, list[Path]]:
+        if folder not in self._by_stem:
+            stems: dict[str, list[Path]] = {}
+            for file in folder.iterdir() if is_folder(folder) else ():
+                if file.suffix.lower() in IMAGE_SUFFIXES and is_file(file):
+                    stems.setdefault(_key(file.stem), []).append(file)
+            self._by_stem[folder] = stems
+        return self._by_stem[folder]
+
+
+def moves(below: Path) -> list[tuple[int, Callable[[Path], list[Path]]]]:
+    """Where files of a capture may lie instead of where it lists them, in the order to look.
+
+    Each comes with how many pixels of the photograph one of what lies there stands for.
+
+    Args:
+        below: The capture's folder.
+    """
+    found: list[tuple[int, Callable[[Path], list[Path]]]] = [
+        (1, partial(_moved_path, dropped=dropped, folder=folder, below=below))
+        for dropped in range(_DEEPEST + 1)
+        for folder in _FOLDERS
+    ]
+    return found + [(number, partial(_smaller, number=number, below=below)) for number in SMALLER]
+
+
+def _moved_path(path: Path, *, dropped: int, folder: str, below: Path) -> list[Path]:
+    """A path in a folder of the capture, without its first folders."""
+    parts = path.relative_to(below).parts if path.is_relative_to(below) else path.parts[1:]
+    parts = tuple(part for part in parts if part != "..")
+    return [below.joinpath(folder, *parts[dropped:])] if dropped < len(parts) else []
+
+
+def _smaller(path: Path, *, number: int, below: Path) -> list[Path]:
+    """Where a smaller copy of a file may lie: a folder of its path with a number at its name.
+
+    The name of the capture's folder stays.
+    """
+    parts = path.relative_to(below).parts if path.is_relative_to(below) else path.parts[-2:]
+    base = path.parents[len(parts) - 1] if len(parts) <= len(path.parents) else path.parent
+    copies: list[Path] = []
+    for i, part in enumerate(parts[:-1]):
+        if part not in (".", ".."):
+            copies.append(base.joinpath(*parts[:i], f"{part}_{number}", *parts[i + 1 :]))
+    return copies
+
+
+def _key(stem: str) -> str:
+    """What stems have in common that differ in case or in how accents are written."""
+    return unicodedata.normalize("NFC", stem).casefold()
+
+
+def _rank(file: Path) -> tuple[int, str]:
+    """Of files of one stem the one to take comes first: PNG before JPEG before others."""
+    suffix = file.suffix.lower()
+    return (_FIRST.index(suffix) if suffix in _FIRST else len(_FIRST), file.name)
+
+
 def build_capture(
     path: Path,
     raw: Sequence[RawView],
@@ -49,6 +153,8 @@ def build_capture(
     points: PointCloud | None = None,
     splats: Path | None = None,
     notes: Sequence[str] = (),
+    up: tuple[float, float, float] | None = None,
+    metres_per_unit: float | None = None,
     strict: bool = False,
 ) -> Capture:
     """Check what a reader found and make the capture of it.
@@ -58,7 +164,8 @@ def build_capture(
     be opened, are of another shape than their intrinsics or their mask, or have an impossible pose
     or lens are left out, and a note names them. They are left out before views are split, and after
     they are named: a view keeps its name when the others come back. Start points that are not
-    finite are left out and counted.
+    finite are left out and counted. What metadata.json says comes before `up` and
+    `metres_per_unit`.
 
     Raises:
         InputError: If there is no photograph, one is listed twice, more than half of the
@@ -76,13 +183,12 @@ def build_capture(
         names = view_names([view.relative for view in raw])
     order = sorted(range(len(raw)), key=lambda i: names[i])
     missing = tuple(raw[i].relative for i in order if not is_file(raw[i].image))
-    _check_missing(path, missing, listed=len(raw), strict=strict)
-    order = [i for i in order if is_file(raw[i].image)]
-    left_out = [_left_out(missing, listed=len(raw))] if missing else []
-    cameras, camera_notes = _cameras(path, raw, order, strict=strict)
+    left_out = _left_out(path, missing, listed=len(raw), strict=strict)
+    cameras, camera_notes = _cameras(
+        path, raw, [i for i in order if is_file(raw[i].image)], strict=strict
+    )
     order = [i for i in order if i in cameras]
     used = [raw[i] for i in order]
-    _check_paths(path, used)
     _check_files(path, used)
     splits, split_note = _splits(used)
     with made_from(path):
@@ -102,8 +208,7 @@ def build_capture(
     point_notes: tuple[str, ...] = ()
     if points is not None:
         points, point_notes = finite_points(points, where=path, strict=strict)
-    found = (*left_out, *found_notes, *camera_notes, *point_notes, *notes)
-    found += (*([split_note] if split_note else []), *_size_notes(views))
+    found = (*left_out, *found_notes, *camera_notes, *point_notes, *notes, *split_note)
     with made_from(path):
         return Capture(
             path=path,
@@ -111,31 +216,12 @@ def build_capture(
             views=tuple(views),
             points=points,
             classes=metadata.classes,
-            up=metadata.up,
-            metres_per_unit=metadata.metres_per_unit,
+            up=metadata.up or up,
+            metres_per_unit=metadata.metres_per_unit or metres_per_unit,
             splats=splats,
-            notes=found,
+            notes=(*found, *_size_notes(views)),
             missing=missing,
         )
-
-
-def finite_points(
-    points: PointCloud, *, where: Path, strict: bool
-) -> tuple[PointCloud, tuple[str, ...]]:
-    """Start points without those that are NaN or infinite, and a note that counts them.
-
-    Raises:
-        InputError: If all are, or any with `strict`; `where` starts the message.
-    """
-    kept = torch.isfinite(points.points).all(dim=1)
-    lost = int((~kept).sum())
-    if lost == 0:
-        return points, ()
-    if strict or lost == len(points):
-        raise InputError(f"{where}: {lost} of {len(points)} start points are not finite.")
-    colours = None if points.colours is None else points.colours[kept]
-    note = f"{lost} of {len(points)} start points are not finite and are left out"
-    return PointCloud(points=points.points[kept], colours=colours), (note,)
 
 
 def _located(path: Path, raw: Sequence[RawView]) -> tuple[list[RawView], list[str]]:
@@ -292,41 +378,32 @@ def view_names(relatives: Sequence[str]) -> list[str]:
     )
 
 
-def _check_paths(path: Path, raw: Sequence[RawView]) -> None:
-    """Refuse names that no scene can hold, before there is one to lose."""
-    check_utf8(path)
-    for view in raw:
-        for file in (view.image, view.mask, view.depth):
-            if file is not None:
-                check_utf8(file)
-
-
-def _check_missing(path: Path, missing: Sequence[str], *, listed: int, strict: bool) -> None:
-    """Refuse a capture of which too much is missing."""
-    there = listed - len(missing)
-    if not missing or (not strict and there >= MIN_THERE * listed):
-        return
-    allowed = "all of them" if strict else "at least half of them"
-    raise MissingFileError(
-        f"{path}: {len(missing)} of {listed} photographs that it lists are not there, expected "
-        f"{allowed} ({_first(missing)})."
-    )
-
-
-def _left_out(missing: Sequence[str], *, listed: int) -> str:
-    """The note that names photographs that are not there."""
+def _left_out(path: Path, missing: Sequence[str], *, listed: int, strict: bool) -> tuple[str, ...]:
+    """The note that names photographs that are not there; too many of them are refused."""
+    if not missing:
+        return ()
+    if strict or listed - len(missing) < MIN_THERE * listed:
+        allowed = "all of them" if strict else "at least half of them"
+        raise MissingFileError(
+            f"{path}: {len(missing)} of {listed} photographs that it lists are not there, expected "
+            f"{allowed} ({_first(missing)})."
+        )
     verb = "is" if len(missing) == 1 else "are"
     return (
         f"{len(missing)} of {listed} photographs that the capture lists {verb} not there and left "
-        f"out ({_first(missing, _NAMED)})"
+        f"out ({_first(missing, _NAMED)})",
     )
 
 
 def _check_files(path: Path, raw: Sequence[RawView]) -> None:
-    for what, files in (
-        ("masks", [view.mask for view in raw if view.mask is not None]),
-        ("depth maps", [view.depth for view in raw if view.depth is not None]),
-    ):
+    """Refuse names that no scene can hold, before there is one to lose, and files that lack."""
+    check_utf8(path)
+    for view in raw:
+        check_utf8(view.image)
+    for what, named in (("masks", [v.mask for v in raw]), ("depth maps", [v.depth for v in raw])):
+        files = [file for file in named if file is not None]
+        for file in files:
+            check_utf8(file)
         missing = [str(file) for file in files if not is_file(file)]
         if missing:
             raise MissingFileError(
@@ -340,17 +417,12 @@ def _first(names: Sequence[str], count: int = 5) -> str:
     return "".join(c if c.isprintable() else "?" for c in listed)
 
 
-def _splits(raw: Sequence[RawView]) -> tuple[list[str], str | None]:
-    """Splits of views that are already sorted by name."""
-    if any(view.split is not None for view in raw):
-        return [view.split or "train" for view in raw], None
-    if len(raw) == 1:
-        return ["train"], None
+def _splits(raw: Sequence[RawView]) -> tuple[list[str], tuple[str, ...]]:
+    """Splits of views that are already sorted by name, and a note where they are not their own."""
+    if len(raw) == 1 or any(view.split is not None for view in raw):
+        return [view.split or "train" for view in raw], ()
     splits = ["test" if i % TEST_EVERY == 0 else "train" for i in range(len(raw))]
-    return (
-        splits,
-        f"no split of its own: every {TEST_EVERY}th view by name is a test view",
-    )
+    return splits, (f"no split of its own: every {TEST_EVERY}th view by name is a test view",)
 
 
 def _size_notes(views: Sequence[View]) -> list[str]:
@@ -359,8 +431,7 @@ def _size_notes(views: Sequence[View]) -> list[str]:
         return []
     camera = large[0].camera
     width, height = reduced_size(camera.width, camera.height, DEFAULT_LONGEST)
-    note = (
+    return [
         f"{len(large)} photographs are larger than {DEFAULT_LONGEST} pixels "
         f"({camera.width}x{camera.height}); they are worked on at {width}x{height}"
-    )
-    return [note]
+    ]

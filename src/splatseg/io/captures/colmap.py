@@ -5,11 +5,16 @@ from pathlib import Path
 
 from splatseg.core import Capture
 from splatseg.errors import InputError, MissingFileError, brief, quoted
-from splatseg.io.captures import _colmap_binary, _colmap_text
-from splatseg.io.captures._nerfstudio_split import splits_beside
-from splatseg.io.captures._photographs import Photographs
-from splatseg.io.captures.build import MIN_THERE, build_capture
-from splatseg.io.captures.colmap_model import ColmapModel, intrinsics_of, poses_of
+from splatseg.io.captures.build import MIN_THERE, Photographs, build_capture
+from splatseg.io.captures.colmap_model import (
+    ColmapModel,
+    intrinsics_of,
+    is_binary_model,
+    poses_of,
+    read_colmap_model,
+    read_images,
+)
+from splatseg.io.captures.nerfstudio import splits_beside
 from splatseg.io.captures.raw_views import RawView
 from splatseg.io.foreign import is_folder
 
@@ -81,8 +86,7 @@ def read_colmap(folder: Path, *, strict: bool = False) -> Capture:
         if image.camera_id not in lenses:
             raise InputError(
                 f"{model_folder}: image {quoted(image.name)} names camera "
-                f"{quoted(image.camera_id)}, "
-                "which is not there."
+                f"{quoted(image.camera_id)}, which is not there."
             )
         relative = image.name.replace("\\", "/")
         raw.append(
@@ -95,31 +99,7 @@ def read_colmap(folder: Path, *, strict: bool = False) -> Capture:
             )
         )
     return build_capture(
-        root,
-        raw,
-        format="colmap",
-        points=model.points,
-        notes=notes,
-        strict=strict,
-    )
-
-
-def read_colmap_model(folder: Path) -> ColmapModel:
-    """Read a sparse model; points, rigs and frames may lack.
-
-    Raises:
-        FileFormatError: If a file is cut short, corrupt or cannot be parsed.
-    """
-    binary = (folder / "cameras.bin").is_file() and (folder / "images.bin").is_file()
-    reader, suffix = (_colmap_binary, ".bin") if binary else (_colmap_text, ".txt")
-    points, rigs, frames = (folder / f"{stem}{suffix}" for stem in ("points3D", "rigs", "frames"))
-    five = rigs.is_file() and frames.is_file()
-    return ColmapModel(
-        cameras=reader.read_cameras(folder / f"cameras{suffix}"),
-        images=reader.read_images(folder / f"images{suffix}"),
-        points=reader.read_points(points) if points.is_file() else None,
-        rigs=reader.read_rigs(rigs) if five else {},
-        frames=reader.read_frames(frames) if five else (),
+        root, raw, format="colmap", points=model.points, notes=notes, strict=strict
     )
 
 
@@ -151,11 +131,8 @@ def _largest(found: Path, *, named: bool) -> tuple[Path, list[str]]:
 
 def _photograph_count(model: Path) -> int:
     """Photographs of a model; 0 where it is damaged, so that it is never the largest."""
-    binary = (model / "cameras.bin").is_file() and (model / "images.bin").is_file()
     try:
-        if binary:
-            return len(_colmap_binary.read_images(model / "images.bin"))
-        return len(_colmap_text.read_images(model / "images.txt"))
+        return len(read_images(model / ("images.bin" if is_binary_model(model) else "images.txt")))
     except InputError:
         return 0
 

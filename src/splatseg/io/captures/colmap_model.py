@@ -1,60 +1,79 @@
-"""A COLMAP model in memory, and what its camera models mean.
+"""COLMAP's sparse models, as binary and as text files, and what its camera models mean.
 
-Camera models and their parameter order are those of COLMAP's ``sensor/models.h``; ids are what
-the binary files hold.
+    cameras     camera_id u32, model i32 (a word as text), width u64, height u64, parameters f64
+    images      image_id u32, q 4 f64, t 3 f64, camera_id u32, name, then 2D points
+    points3D    id u64, xyz 3 f64, rgb 3 u8, error f64, track
+    rigs        rig_id u32, m u32, and if m > 0: reference sensor (type i32, id u32),
+                m - 1 times (type i32, id u32, has_pose u8, if so q 4 f64, t 3 f64)
+    frames      frame_id u32, rig_id u32, q 4 f64, t 3 f64, m u32,
+                m times (type i32, sensor id u32, data id u64)
+
+Binary files are little-endian, tightly packed and begin with the number of records; text files
+have a record a line (of images two, the second one with 2D points), and comments after #. Every
+read is checked against the end of the file, so that a file that breaks off is an error that says
+where, never a crash or a shorter model. Camera models and their parameter order are those of
+COLMAP's ``sensor/models.h``.
 """
 
-import math
+import struct
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from splatseg.core import CameraModel, PointCloud
 from splatseg.errors import InputError, quoted
-from splatseg.io.captures.raw_views import MAX_SIDE, Intrinsics
+from splatseg.io.captures.points import point_cloud, read_ply_points
+from splatseg.io.captures.raw_views import Intrinsics, pose_of_quaternion
+from splatseg.io.foreign import read_bytes, reading
+from splatseg.io.schema import MAX_SIDE, expect, malformed
 
-MODELS: dict[int, tuple[str, int]] = {
-    0: ("SIMPLE_PINHOLE", 3),
-    1: ("PINHOLE", 4),
-    2: ("SIMPLE_RADIAL", 4),
-    3: ("RADIAL", 5),
-    4: ("OPENCV", 8),
-    5: ("OPENCV_FISHEYE", 8),
-    6: ("FULL_OPENCV", 12),
-    7: ("FOV", 5),
-    8: ("SIMPLE_RADIAL_FISHEYE", 4),
-    9: ("RADIAL_FISHEYE", 5),
-    10: ("THIN_PRISM_FISHEYE", 12),
-    11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
-    12: ("SIMPLE_DIVISION", 4),
-    13: ("DIVISION", 5),
-    14: ("SIMPLE_FISHEYE", 3),
-    15: ("FISHEYE", 4),
-    16: ("EUCM", 6),
-    17: ("EQUIRECTANGULAR", 2),
-}
-"""Name and number of parameters by the id of the binary files."""
+_POSE = "d" * 7
+_CAMERA_SENSOR = 0
+_MAX_NAME = 4096
+_BESIDE = ("points3D.ply", "sparse_pc.ply")
 
-PARAMETER_COUNTS = dict(MODELS.values())
-"""Number of parameters by name."""
 
-_LENSES: dict[str, tuple[CameraModel, int]] = {
-    "SIMPLE_PINHOLE": ("pinhole", 1),
-    "PINHOLE": ("pinhole", 2),
-    "SIMPLE_RADIAL": ("opencv", 1),
-    "RADIAL": ("opencv", 1),
-    "OPENCV": ("opencv", 2),
-    "FULL_OPENCV": ("opencv", 2),
-    "OPENCV_FISHEYE": ("fisheye", 2),
-    "SIMPLE_RADIAL_FISHEYE": ("fisheye", 1),
-    "RADIAL_FISHEYE": ("fisheye", 1),
-    "SIMPLE_FISHEYE": ("fisheye", 1),
-    "FISHEYE": ("fisheye", 2),
-    "THIN_PRISM_FISHEYE": ("thin_prism_fisheye", 2),
-}
-# Our lens model and the number of focal lengths. The principal point follows them, then the
-# distortion in OpenCV's order, of which the simpler models give the first values.
+class _Lens(NamedTuple):
+    """A camera model of COLMAP."""
+
+    name: str
+    parameters: int
+    model: CameraModel | None = None
+    """Ours; None goes through pycolmap."""
+
+    focals: int = 1
+    """Focal lengths. The principal point follows them, then the distortion in OpenCV's order, of
+    which the simpler models give the first values."""
+
+
+MODELS = (
+    _Lens("SIMPLE_PINHOLE", 3, "pinhole"),
+    _Lens("PINHOLE", 4, "pinhole", 2),
+    _Lens("SIMPLE_RADIAL", 4, "opencv"),
+    _Lens("RADIAL", 5, "opencv"),
+    _Lens("OPENCV", 8, "opencv", 2),
+    _Lens("OPENCV_FISHEYE", 8, "fisheye", 2),
+    _Lens("FULL_OPENCV", 12, "opencv", 2),
+    _Lens("FOV", 5),
+    _Lens("SIMPLE_RADIAL_FISHEYE", 4, "fisheye"),
+    _Lens("RADIAL_FISHEYE", 5, "fisheye"),
+    _Lens("THIN_PRISM_FISHEYE", 12, "thin_prism_fisheye", 2),
+    _Lens("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+    _Lens("SIMPLE_DIVISION", 4),
+    _Lens("DIVISION", 5),
+    _Lens("SIMPLE_FISHEYE", 3, "fisheye"),
+    _Lens("FISHEYE", 4, "fisheye", 2),
+    _Lens("EUCM", 6),
+    _Lens("EQUIRECTANGULAR", 2),
+)
+"""By the number of the binary files."""
+
+_LENSES = {lens.name: lens for lens in MODELS}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -77,13 +96,6 @@ class ColmapImage:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ColmapRig:
-    """Cameras that are mounted together: cam_from_rig by camera id."""
-
-    cam_from_rig: dict[int, NDArray[np.float64]]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class ColmapFrame:
     """One moment of a rig and the images taken at it."""
 
@@ -101,8 +113,58 @@ class ColmapModel:
     cameras: dict[int, ColmapCamera]
     images: dict[int, ColmapImage]
     points: PointCloud | None
-    rigs: dict[int, ColmapRig] = field(default_factory=dict[int, ColmapRig])
+    rigs: dict[int, dict[int, NDArray[np.float64]]] = field(
+        default_factory=dict[int, dict[int, NDArray[np.float64]]]
+    )
+    """cam_from_rig by rig id and camera id."""
+
     frames: tuple[ColmapFrame, ...] = ()
+
+
+def read_colmap_model(folder: Path) -> ColmapModel:
+    """Read a sparse model; points, rigs and frames may lack.
+
+    Raises:
+        FileFormatError: If a file is cut short, corrupt or cannot be parsed.
+    """
+    suffix = ".bin" if is_binary_model(folder) else ".txt"
+    points, rigs, frames = (folder / f"{stem}{suffix}" for stem in ("points3D", "rigs", "frames"))
+    five = rigs.is_file() and frames.is_file()
+    return ColmapModel(
+        cameras=dict(read_records(folder / f"cameras{suffix}")),
+        images=read_images(folder / f"images{suffix}"),
+        points=read_points(points) if points.is_file() else None,
+        rigs=dict(read_records(rigs)) if five else {},
+        frames=tuple(read_records(frames)) if five else (),
+    )
+
+
+def is_binary_model(folder: Path) -> bool:
+    """Whether a folder has a model in binary files, which come before text."""
+    return (folder / "cameras.bin").is_file() and (folder / "images.bin").is_file()
+
+
+def read_images(path: Path) -> dict[int, ColmapImage]:
+    """Registered photographs by id; their 2D points are passed over."""
+    return dict(read_records(path))
+
+
+def read_points(path: Path) -> PointCloud:
+    """Positions and colours of points3D; tracks are passed over."""
+    values = np.fromiter(chain.from_iterable(read_records(path)), np.float64).reshape(-1, 6)
+    return point_cloud(values[:, :3], values[:, 3:].astype(np.uint8))
+
+
+def points_beside(folder: Path) -> PointCloud | None:
+    """Points of points3D.ply, sparse_pc.ply or points3D.bin in a folder, or None.
+
+    They are taken to lie in the same world as the poses beside them.
+    """
+    for name in _BESIDE:
+        if (folder / name).is_file():
+            return read_ply_points(folder / name)
+    path = folder / "points3D.bin"
+    return read_points(path) if path.is_file() else None
 
 
 def intrinsics_of(camera: ColmapCamera, *, where: str) -> Intrinsics:
@@ -116,50 +178,28 @@ def intrinsics_of(camera: ColmapCamera, *, where: str) -> Intrinsics:
         InputError: If the model is one that cannot be undistorted, or parameters lack.
         MissingPackageError: If it needs pycolmap, and that is not installed.
     """
-    if camera.model not in PARAMETER_COUNTS:
-        raise InputError(
-            f"{where}: expected a camera model of COLMAP ({', '.join(PARAMETER_COUNTS)}), "
-            f"got {quoted(camera.model)}."
-        )
-    expected, values = PARAMETER_COUNTS[camera.model], camera.parameters
-    if len(values) != expected:
-        raise InputError(
-            f"{where}: expected {expected} parameters of a {camera.model} camera, "
-            f"got {len(values)}."
-        )
-    if camera.model not in _LENSES:
-        if not (1 <= camera.width <= MAX_SIDE and 1 <= camera.height <= MAX_SIDE):
-            raise InputError(f"{where}: expected 1 to {MAX_SIDE} pixels a side, got others.")
-        from splatseg.io.captures._pycolmap_lens import lens_by_pycolmap
+    lens, values = _LENSES.get(camera.model), camera.parameters
+    if lens is None:
+        raise malformed(where, f"a camera model of COLMAP ({', '.join(_LENSES)})", camera.model)
+    fits = len(values) == lens.parameters
+    expect(fits, where, f"{lens.parameters} parameters of a {lens.name} camera, got {len(values)}")
+    if lens.model is None:
+        fits = 1 <= camera.width <= MAX_SIDE and 1 <= camera.height <= MAX_SIDE
+        expect(fits, where, f"1 to {MAX_SIDE} pixels a side, got others")
+        from splatseg.io.captures.pycolmap_lens import lens_by_pycolmap
 
-        return lens_by_pycolmap(camera.model, camera.width, camera.height, values, where=where)
-    model, focals = _LENSES[camera.model]
-    cx, cy, *distortion = values[focals:]
+        return lens_by_pycolmap(lens.name, camera.width, camera.height, values, where=where)
+    cx, cy, *distortion = values[lens.focals :]
     return Intrinsics(
-        model=model,
+        model=lens.model,
         fx=values[0],
-        fy=values[focals - 1],
+        fy=values[lens.focals - 1],
         cx=cx,
         cy=cy,
         distortion=tuple(distortion),
         width=camera.width,
         height=camera.height,
     )
-
-
-def rigid_matrix(values: tuple[float, ...]) -> NDArray[np.float64]:
-    """4 x 4 transform of qw qx qy qz tx ty tz; a zero quaternion gives NaN, found later."""
-    w, x, y, z = values[:4]
-    length = math.hypot(w, x, y, z)
-    w, x, y, z = (v / length if 0 < length < math.inf else float("nan") for v in (w, x, y, z))
-    matrix = np.eye(4)
-    matrix[:3, :3] = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    matrix[:3, 3] = values[4:7]
-    return matrix
 
 
 def poses_of(model: ColmapModel, *, where: str) -> dict[int, NDArray[np.float64]]:
@@ -180,10 +220,248 @@ def poses_of(model: ColmapModel, *, where: str) -> dict[int, NDArray[np.float64]
             if image_id not in poses:
                 # An image of the frame that was not registered has no row of its own.
                 continue
-            if camera_id not in rig.cam_from_rig:
+            if camera_id not in rig:
                 raise InputError(
                     f"{where}: image {image_id} was taken by camera {camera_id}, whose place in "
                     f"rig {frame.rig_id} is not known."
                 )
-            poses[image_id] = rig.cam_from_rig[camera_id] @ frame.rig_from_world
+            poses[image_id] = rig[camera_id] @ frame.rig_from_world
     return poses
+
+
+class _Source(Protocol):
+    """Fields of records, one after another, of a binary file or a line of text."""
+
+    def take(self, codes: str) -> tuple[float, ...]:
+        """Numbers by the codes of `struct`."""
+        ...
+
+    def lens(self) -> tuple[str, tuple[float, ...]]:
+        """Model, width, height and parameters of a camera: name, and numbers."""
+        ...
+
+    def is_camera(self) -> bool:
+        """Whether the sensor whose type comes next is a camera."""
+        ...
+
+    def name(self) -> str:
+        """The name of a photograph."""
+        ...
+
+    def pass_over(self, size: int, *, after: int = 0) -> None:
+        """Leave out some bytes, and a list of records of so many."""
+        ...
+
+
+def _camera(source: _Source) -> tuple[int, ColmapCamera]:
+    (id,) = source.take("I")
+    model, (width, height, *parameters) = source.lens()
+    width, height = int(width), int(height)
+    return int(id), ColmapCamera(
+        model=model, width=width, height=height, parameters=tuple(parameters)
+    )
+
+
+def _image(source: _Source) -> tuple[int, ColmapImage]:
+    id, *pose, camera = source.take(f"I{_POSE}I")
+    name = source.name()
+    source.pass_over(24)
+    cam_from_world = pose_of_quaternion(pose)
+    return int(id), ColmapImage(name=name, camera_id=int(camera), cam_from_world=cam_from_world)
+
+
+def _point(source: _Source) -> tuple[float, ...]:
+    _, *found = source.take("QdddBBB")
+    source.pass_over(8, after=8)
+    return tuple(found)
+
+
+def _rig(source: _Source) -> tuple[int, dict[int, NDArray[np.float64]]]:
+    id, sensors = source.take("II")
+    poses: dict[int, NDArray[np.float64]] = {}
+    for index in range(int(sensors)):
+        camera = source.is_camera()
+        (sensor,) = source.take("I")
+        # The first sensor is the reference: the rig's own axes are its axes.
+        pose = np.eye(4) if index == 0 else None
+        if index > 0 and source.take("B")[0]:
+            pose = pose_of_quaternion(source.take(_POSE))
+        if camera and pose is not None:
+            poses[int(sensor)] = pose
+    return int(id), poses
+
+
+def _frame(source: _Source) -> ColmapFrame:
+    _, rig, *pose, count = source.take(f"II{_POSE}I")
+    images: list[tuple[int, int]] = []
+    for _ in range(int(count)):
+        camera = source.is_camera()
+        sensor, image = source.take("IQ")
+        if camera:
+            images.append((int(sensor), int(image)))
+    rig_from_world = pose_of_quaternion(pose)
+    return ColmapFrame(rig_id=int(rig), rig_from_world=rig_from_world, images=tuple(images))
+
+
+class _Layout(NamedTuple):
+    """What the records of a file are."""
+
+    parse: Callable[[_Source], Any]
+    columns: str
+    min_bytes: int
+    """What a record takes in a binary file at least."""
+
+    max_words: int = 0
+    """Into how many words a line of text is split; 0 is all. The last is the rest of it."""
+
+    lines: int = 1
+    """Of so many lines of text a record is the first."""
+
+
+_POSE_COLUMNS = "QW QX QY QZ TX TY TZ"
+_LAYOUTS = {
+    "cameras": _Layout(_camera, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS", 24),
+    "images": _Layout(_image, f"IMAGE_ID {_POSE_COLUMNS} CAMERA_ID NAME", 73, 10, 2),
+    "points3D": _Layout(_point, "POINT3D_ID X Y Z R G B ERROR", 51, 9),
+    "rigs": _Layout(_rig, "RIG_ID NUM_SENSORS REF_TYPE REF_ID SENSORS", 8),
+    "frames": _Layout(_frame, f"FRAME_ID RIG_ID {_POSE_COLUMNS} NUM_DATA DATA", 68),
+}
+"""By the stem of the file."""
+
+
+def read_records(path: Path) -> Iterator[Any]:
+    """Records of a file, binary or text by its suffix."""
+    layout = _LAYOUTS[path.stem]
+    if path.suffix == ".bin":
+        cursor = _Cursor(path)
+        for _ in range(cursor.count(layout.min_bytes)):
+            yield layout.parse(cursor)
+        cursor.finish()
+        return
+    with reading(path, "a text file in UTF-8"):
+        text = path.read_text(encoding="utf-8").splitlines()
+    number = 0
+    while number < len(text):
+        line = text[number].strip()
+        number += 1
+        if not line or line.startswith("#"):
+            continue
+        try:
+            record = layout.parse(_Line(line.split(maxsplit=layout.max_words - 1)))
+        except (ValueError, IndexError, OverflowError) as error:
+            raise malformed(f"{path}: line {number}", layout.columns, line) from error
+        # Lines that follow belong to the same record even when they are empty.
+        number += layout.lines - 1
+        yield record
+
+
+class _Line:
+    """The words of a line of text."""
+
+    def __init__(self, words: Sequence[str]) -> None:
+        self._words, self._at = words, 0
+
+    def _word(self) -> str:
+        self._at += 1
+        return self._words[self._at - 1]
+
+    def take(self, codes: str) -> tuple[float, ...]:
+        return tuple([_number(self._word(), code) for code in codes])
+
+    def lens(self) -> tuple[str, tuple[float, ...]]:
+        model, sides = self._word(), self.take("QQ")
+        return model, (*sides, *self.take("d" * (len(self._words) - self._at)))
+
+    def is_camera(self) -> bool:
+        return self._word() == "CAMERA"
+
+    def name(self) -> str:
+        return self._word()
+
+    def pass_over(self, size: int, *, after: int = 0) -> None:
+        pass
+
+
+def _number(word: str, code: str) -> float:
+    if code == "d":
+        return float(word)
+    value = int(word)
+    if value < 0 or (code == "B" and value > 255):
+        raise ValueError("a number does not fit")
+    return value
+
+
+class _Cursor:
+    """Reads records off a file's bytes and refuses to run past its end."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._data = read_bytes(path, "a file of COLMAP")
+        self._offset = 0
+
+    def take(self, codes: str) -> tuple[float, ...]:
+        layout = f"<{codes}"
+        return struct.unpack_from(layout, self._data, self._skip(struct.calcsize(layout)))
+
+    def _skip(self, size: int) -> int:
+        """Move on by `size` bytes; gives where they start."""
+        start = self._offset
+        if start + size > len(self._data):
+            raise malformed(
+                self._path,
+                f"{size} more bytes at byte {start}, but the file ends after {len(self._data)}: it "
+                "is cut short or corrupt",
+            )
+        self._offset = start + size
+        return start
+
+    def count(self, min_bytes: int) -> int:
+        """The number of records that follow, each of at least this many bytes."""
+        number = int(self.take("Q")[0])
+        left = len(self._data) - self._offset
+        if number * min_bytes > left:
+            raise malformed(
+                self._path,
+                f"{number} records of at least {min_bytes} bytes, but {left} bytes are left: it is "
+                "cut short or corrupt",
+            )
+        return number
+
+    def lens(self) -> tuple[str, tuple[float, ...]]:
+        number = int(self.take("i")[0])
+        known = f"a model number of a camera from 0 to {len(MODELS) - 1}"
+        expect(0 <= number < len(MODELS), self._path, known, number)
+        lens = MODELS[number]
+        return lens.name, self.take("QQ" + "d" * lens.parameters)
+
+    def is_camera(self) -> bool:
+        return self.take("i")[0] == _CAMERA_SENSOR
+
+    def name(self) -> str:
+        """Characters up to a zero byte."""
+        end = self._data.find(b"\0", self._offset, self._offset + _MAX_NAME)
+        if end < 0:
+            raise malformed(
+                self._path,
+                f"a name that ends with a zero byte at byte {self._offset}: the file is cut short "
+                "or corrupt",
+            )
+        raw = self._data[self._offset : end]
+        self._offset = end + 1
+        try:
+            return raw.decode("utf-8")
+        except UnicodeDecodeError as error:
+            raise malformed(self._path, f"names in UTF-8, got {quoted(raw)}") from error
+
+    def pass_over(self, size: int, *, after: int = 0) -> None:
+        self._skip(after)
+        self._skip(size * self.count(size))
+
+    def finish(self) -> None:
+        """Refuse bytes after the last record."""
+        more = len(self._data) - self._offset
+        expect(
+            not more,
+            self._path,
+            f"the end of the file at byte {self._offset}, got {more} bytes more: it is corrupt",
+        )

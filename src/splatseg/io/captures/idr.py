@@ -8,12 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatseg.core import Capture
-from splatseg.errors import FileFormatError, InputError, MissingFileError
-from splatseg.io.captures._points_beside import points_beside
+from splatseg.errors import InputError, MissingFileError
 from splatseg.io.captures.build import build_capture
+from splatseg.io.captures.colmap_model import points_beside
 from splatseg.io.captures.raw_views import Intrinsics, RawView
 from splatseg.io.images import find_images, image_size
 from splatseg.io.npz import open_npz
+from splatseg.io.schema import check_array
 
 FILES = ("cameras_sphere.npz", "cameras.npz")
 _IMAGE_FOLDERS = ("images", "image")
@@ -63,23 +64,14 @@ def read_idr(folder: Path, *, strict: bool = False) -> Capture:
     ]
     sizes = [image_size(image) for image in images]
     scale = _scale([k for k, _ in parts], sizes, path)
-    raw = [
-        RawView(
-            image=image,
-            relative=image.name,
-            intrinsics=Intrinsics(
-                fx=float(k[0, 0]) * scale,
-                fy=float(k[1, 1]) * scale,
-                cx=float(k[0, 2]) * scale,
-                cy=float(k[1, 2]) * scale,
-                width=width,
-                height=height,
-            ),
-            cam_from_world=pose,
-            mask=masks.get(image.stem),
+    raw: list[RawView] = []
+    for image, (k, pose), (width, height) in zip(images, parts, sizes, strict=True):
+        fx, fy, cx, cy = (float(k[at]) * scale for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        lens = Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
+        mask, name = masks.get(image.stem), image.name
+        raw.append(
+            RawView(image=image, relative=name, intrinsics=lens, cam_from_world=pose, mask=mask)
         )
-        for image, (k, pose), (width, height) in zip(images, parts, sizes, strict=True)
-    ]
     used = set(of_images.values())
     raw += [_missing(folder, index) for index in matrices if index not in used]
     notes = [] if scale == 1 else [f"intrinsics were scaled by {scale:g} to fit the photographs"]
@@ -156,10 +148,8 @@ def _matrices(path: Path) -> dict[int, NDArray[np.float64]]:
         )
         matrices = {index: archive.array(key) for index, key in names}
     for index, matrix in matrices.items():
-        if matrix.shape not in ((4, 4), (3, 4)) or matrix.dtype.kind not in "iuf":
-            raise FileFormatError(
-                f"{path}: expected world_mat_{index} of 4 x 4 numbers, got shape {matrix.shape}."
-            )
+        rows = 3 if len(matrix.shape) == 2 and len(matrix) == 3 else 4
+        check_array(path, f"world_mat_{index}", matrix, (rows, 4))
     return {index: matrix.astype(np.float64) for index, matrix in matrices.items()}
 
 

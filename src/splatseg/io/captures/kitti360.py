@@ -1,39 +1,44 @@
-"""Reads KITTI-360: rectified stereo photographs of a drive, or one of its fisheye cameras.
+"""KITTI-360: rectified stereo photographs of a drive, or one of its fisheye cameras; its poses.
 
-Liao, Xie and Geiger, KITTI-360, TPAMI 2022. `kitti360_drive` says how a drive, a window of frames
-and a camera are named.
+    ROOT/calibration/perspective.txt, image_02.yaml, calib_cam_to_pose.txt, calib_cam_to_velo.txt
+    ROOT/data_poses/DRIVE/poses.txt, cam0_to_world.txt
+    ROOT/data_2d_raw/DRIVE/image_00/data_rect/0000000005.png
+    ROOT/data_3d_raw/DRIVE/velodyne_points/data/0000000005.bin
+    ROOT/data_3d_semantics/train/DRIVE/static/0000000002_0000000385.ply
+
+A drive is named by its folder in any of these, or by ROOT where there is one drive. Frames are
+named by a window behind it, ``.../DRIVE/0000000002_0000000385``, or by the file of accumulated
+points of that name; a camera or a sensor by its folder, ``.../DRIVE/image_02``. Liao, Xie and
+Geiger, KITTI-360, TPAMI 2022.
 """
 
 import re
-from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from splatseg.core import Capture, PointCloud
-from splatseg.errors import FileFormatError, InputError, MissingFileError, quoted
-from splatseg.io.captures._points import point_cloud, vertex_colours
+from splatseg.errors import InputError, MissingFileError
 from splatseg.io.captures.build import build_capture
-from splatseg.io.captures.kitti360_drive import (
-    ACCUMULATED,
-    PHOTOGRAPHS,
-    Drive,
-    calibration_rows,
-    camera_pose,
-    drive_at,
-    find_drive,
-    read_poses,
-    window_name,
-    window_of,
-)
-from splatseg.io.captures.raw_views import Intrinsics, RawView
-from splatseg.io.captures.replica import inverse_pose
-from splatseg.io.foreign import is_folder, read_lines
+from splatseg.io.captures.points import point_cloud, vertex_colours
+from splatseg.io.captures.raw_views import Intrinsics, RawView, checked_pose, inverse_pose
+from splatseg.io.foreign import is_folder
 from splatseg.io.images import find_images
-from splatseg.io.keyed_numbers import keyed_matrix
 from splatseg.io.ply_vertices import read_ply_vertices, vertex_positions
+from splatseg.io.schema import expect, malformed
+from splatseg.io.text_numbers import (
+    keyed_matrix,
+    read_keyed_numbers,
+    read_matrix,
+    read_numbers,
+    rigid,
+)
+
+PHOTOGRAPHS, SCANS, ACCUMULATED = "data_2d_raw", "data_3d_raw", "data_3d_semantics"
+SEMANTICS, POSES = "data_2d_semantics", "data_poses"
+VELODYNE, SICK = "velodyne_points", "sick_points"
 
 PERSPECTIVE = {"image_00": "data_rect", "image_01": "data_rect"}
 FISHEYE = {"image_02": "data_rgb", "image_03": "data_rgb"}
@@ -42,12 +47,242 @@ FISHEYE = {"image_02": "data_rgb", "image_03": "data_rgb"}
 MAX_POINTS = 1_000_000
 """Start points that are taken of the accumulated ones, evenly."""
 
+_TOPS = (PHOTOGRAPHS, SCANS, ACCUMULATED, SEMANTICS, POSES)
+_SPLITS = ("train", "test", "test1", "test2")
+"""Folders between data_3d_semantics or data_2d_semantics and a drive."""
+
+_WINDOW = re.compile(r"(\d{1,10})_(\d{1,10})(?:\.ply)?")
+_DEEPEST = 6
+"""Folders between ROOT and anything that names a drive."""
+
+_PARTS = 3
+"""A drive, a camera or sensor, and the folder of its files."""
+
+_MAX_FRAME = 10**10 - 1
 _PIXEL_CENTRE = 0.5
 """KITTI counts pixels from the centre of the first; here it is at a half."""
 
-_LENS = ("xi", "k1", "k2", "p1", "p2")
-_PROJECTION = ("gamma1", "gamma2", "u0", "v0")
-_SIZE = ("image_width", "image_height")
+_FISHEYE_KEYS = (
+    "gamma1", "gamma2", "u0", "v0", "image_width", "image_height", "xi", "k1", "k2", "p1", "p2",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Drive:
+    """What a path of KITTI-360 names."""
+
+    root: Path
+    """The folder that has ``calibration`` and ``data_poses``."""
+
+    name: str
+    """Such as ``2013_05_28_drive_0009_sync``."""
+
+    window: tuple[int, int] | None = None
+    """First and last frame that are meant; None is all."""
+
+    part: str | None = None
+    """A folder of a camera or sensor that is named: ``image_02``, ``sick_points``, ``dynamic``."""
+
+    top: str | None = None
+    """Through which of the data set's folders it is named, such as ``data_3d_raw``."""
+
+    @property
+    def folder(self) -> Path:
+        """Of its photographs, which stands for the drive."""
+        return self.root / PHOTOGRAPHS / self.name
+
+    def of(self, top: str, *parts: str) -> Path:
+        """A folder or file of the drive in one of the data set's folders."""
+        return self.root.joinpath(top, self.name, *parts)
+
+    def split_folder(self, top: str, *parts: str) -> Path | None:
+        """The same in ``train``, or a test split that has it; None where none does."""
+        paths = (self.root.joinpath(top, split, self.name, *parts) for split in _SPLITS)
+        return next((path for path in paths if is_folder(path)), None)
+
+    def calibration(self, name: str) -> Path:
+        """A file of the calibration.
+
+        Raises:
+            MissingFileError: If it is missing.
+        """
+        path = self.root / "calibration" / name
+        if not path.is_file():
+            raise MissingFileError(
+                f"{path}: expected this file of KITTI-360's calibration, got none; it comes in an "
+                "archive of its own."
+            )
+        return path
+
+    def has(self, frame: int) -> bool:
+        """Whether a frame is meant."""
+        return self.window is None or self.window[0] <= frame <= self.window[1]
+
+    @property
+    def called(self) -> str:
+        """As KITTI-360's evaluation calls a drive or a window of one: ``0009_0000000002_...``."""
+        found = re.fullmatch(r"\d{4}_\d\d_\d\d_drive_(\d{4})_sync", self.name)
+        name = found[1] if found else self.name
+        return name if self.window is None else f"{name}_{window_name(self.window)}"
+
+    @property
+    def frames_in_words(self) -> str:
+        """`` from 2 to 385`` of a window, nothing of all."""
+        return "" if self.window is None else f" from {self.window[0]} to {self.window[1]}"
+
+
+def window_name(window: tuple[int, int]) -> str:
+    """As files of accumulated points are called."""
+    return f"{window[0]:010d}_{window[1]:010d}"
+
+
+def window_of(name: str) -> tuple[int, int] | None:
+    """The frames that a name tells, or None."""
+    found = _WINDOW.fullmatch(name)
+    return None if found is None else (int(found[1]), int(found[2]))
+
+
+def find_drive(path: Path) -> Drive | None:
+    """What a path names, or None where it is none of KITTI-360's.
+
+    Raises:
+        InputError: If it is the data set's folder, with several drives.
+    """
+    whole = path.absolute()
+    for root in (whole, *whole.parents)[: _DEEPEST + 1]:
+        if any(is_folder(root / top) for top in _TOPS):
+            return _named(root, whole.relative_to(root).parts, path)
+    return None
+
+
+def drive_at(path: Path) -> Drive:
+    """What a path names.
+
+    Raises:
+        MissingFileError: If it is none of KITTI-360's.
+        InputError: If it is the data set's folder, with several drives.
+    """
+    found = find_drive(path)
+    if found is None:
+        raise MissingFileError(
+            f"{path}: expected a drive of KITTI-360, such as data_2d_raw/DRIVE beside calibration "
+            "and data_poses, got none."
+        )
+    return found
+
+
+def drives(root: Path) -> tuple[str, ...]:
+    """Names of the drives of which a data set has anything."""
+    folders = [root / top for top in (PHOTOGRAPHS, SCANS, POSES)]
+    folders += [root / top / split for top in (ACCUMULATED, SEMANTICS) for split in _SPLITS]
+    there = (path for folder in folders if is_folder(folder) for path in folder.iterdir())
+    return tuple(sorted({path.name for path in there if is_folder(path)}))
+
+
+def _named(root: Path, parts: tuple[str, ...], path: Path) -> Drive | None:
+    """What the folders below the data set's own one name; None where they are none of a drive."""
+    left = list(parts)
+    window = window_of(left[-1]) if left else None
+    if window is not None:
+        left.pop()
+    top = left.pop(0) if left and left[0] in _TOPS else None
+    if top in (ACCUMULATED, SEMANTICS) and left:
+        left.pop(0)
+    known = drives(root)
+    if not left and len(known) > 1:
+        shown = ", ".join(known[:3]) + (", ..." if len(known) > 3 else "")
+        raise InputError(
+            f"{path}: expected one drive of KITTI-360, got {len(known)} ({shown}); name one, such "
+            f"as {root / PHOTOGRAPHS / known[0]}."
+        )
+    names = left or list(known)
+    if not names or names[0] not in known or len(left) > _PARTS:
+        return None
+    part = left[1] if len(left) > 1 else None
+    return Drive(root=root, name=names[0], window=window, part=part, top=top)
+
+
+def read_poses(drive: Drive) -> dict[int, NDArray[np.float64]]:
+    """world_from_car of the frames that are meant, by number; cars that stand have none.
+
+    ``poses.txt`` has the frame and 3 x 4 numbers a row; where it is missing, poses come from
+    ``cam0_to_world.txt``, the frame and the 4 x 4 pose of the rectified left camera.
+
+    Raises:
+        MissingFileError: If there is neither.
+        InputError: If a row is no frame and pose, or a frame comes twice.
+    """
+    path, of_camera = drive.of(POSES, "poses.txt"), drive.of(POSES, "cam0_to_world.txt")
+    camera_from_car = None
+    if not path.is_file():
+        if not of_camera.is_file():
+            raise MissingFileError(
+                f"{path}: expected the poses of the drive, got none; photographs and scans without "
+                "poses are of no use."
+            )
+        path, camera_from_car = of_camera, np.linalg.inv(camera_pose(drive, "image_00"))
+    height = 3 if camera_from_car is None else 4
+    found: dict[int, NDArray[np.float64]] = {}
+    for i, (frame, *values) in enumerate(read_numbers(path, columns=1 + 4 * height), start=1):
+        expect(
+            0 <= frame <= _MAX_FRAME and frame == int(frame),
+            path,
+            f"a frame first in row {i}, got {frame:g}",
+        )
+        expect(int(frame) not in found, path, f"each frame once, got {int(frame)} twice")
+        if not drive.has(int(frame)):
+            continue
+        pose = np.array(values).reshape(height, 4)
+        pose = checked_pose(rigid(pose) if height == 3 else pose, where=f"{path}: row {i}")
+        found[int(frame)] = pose if camera_from_car is None else pose @ camera_from_car
+    return found
+
+
+def camera_pose(drive: Drive, camera: str) -> NDArray[np.float64]:
+    """car_from_camera, 4 x 4; of a rectified camera after its rectification.
+
+    Raises:
+        MissingFileError: If a file of the calibration is missing.
+        InputError: If it lacks the camera, or has no rotation.
+    """
+    pose = _car_from_camera(drive, camera)
+    if camera not in PERSPECTIVE:
+        return pose
+    path, name = drive.calibration("perspective.txt"), f"R_rect_{camera[-2:]}"
+    rectified = np.eye(4)
+    rectified[:3, :3] = keyed_matrix(read_keyed_numbers(path), name, (3, 3), path=path)
+    return pose @ np.linalg.inv(checked_pose(rectified, where=f"{path}: {name}"))
+
+
+def velodyne_pose(drive: Drive) -> NDArray[np.float64]:
+    """car_from_velodyne, 4 x 4: by the left camera, before its rectification.
+
+    Raises:
+        MissingFileError: If a file of the calibration is missing.
+        InputError: If it has no rotation.
+    """
+    velodyne_from_camera = _transform(drive.calibration("calib_cam_to_velo.txt"))
+    return _car_from_camera(drive, "image_00") @ np.linalg.inv(velodyne_from_camera)
+
+
+def sick_pose(drive: Drive) -> NDArray[np.float64]:
+    """velodyne_from_sick, 4 x 4.
+
+    Raises:
+        MissingFileError: If the calibration is missing.
+        InputError: If it has no rotation.
+    """
+    return _transform(drive.calibration("calib_sick_to_velo.txt"))
+
+
+def _car_from_camera(drive: Drive, camera: str) -> NDArray[np.float64]:
+    path = drive.calibration("calib_cam_to_pose.txt")
+    matrix = keyed_matrix(read_keyed_numbers(path), camera, (3, 4), path=path)
+    return checked_pose(rigid(matrix), where=f"{path}: {camera}")
+
+
+def _transform(path: Path) -> NDArray[np.float64]:
+    return checked_pose(rigid(read_matrix(path, (3, 4), "a 3 x 4 transform")), where=str(path))
 
 
 def find_kitti360(path: Path) -> bool:
@@ -91,7 +326,7 @@ def read_kitti360(path: Path, *, strict: bool = False) -> Capture:
     if not posed:
         raise InputError(
             f"{path}: expected photographs with poses, got {len(frames)} frames"
-            f"{_of_window(drive)} of which none has a pose."
+            f"{drive.frames_in_words} of which none has a pose."
         )
     split = {frame: "test" if i % 2 else "train" for i, frame in enumerate(posed)}
     raw: list[RawView] = []
@@ -139,9 +374,8 @@ def static_windows(drive: Drive, *, part: str = "static") -> dict[tuple[int, int
 
 
 def _cameras(drive: Drive) -> tuple[str, ...]:
-    known = PERSPECTIVE | FISHEYE
-    if drive.part in known:
-        return (drive.part,)
+    if drive.part in PERSPECTIVE | FISHEYE:
+        return (str(drive.part),)
     found = tuple(c for c in PERSPECTIVE if is_folder(drive.of(PHOTOGRAPHS, c, PERSPECTIVE[c])))
     if not found:
         raise MissingFileError(
@@ -152,13 +386,8 @@ def _cameras(drive: Drive) -> tuple[str, ...]:
 
 
 def _numbered(drive: Drive, camera: str) -> list[tuple[int, Path]]:
-    folder = drive.of(PHOTOGRAPHS, camera, (PERSPECTIVE | FISHEYE)[camera])
-    files = [(file.stem, file) for file in find_images(folder)]
-    return [(int(stem), file) for stem, file in files if re.fullmatch(r"[0-9]{1,10}", stem)]
-
-
-def _of_window(drive: Drive) -> str:
-    return "" if drive.window is None else f" from {drive.window[0]} to {drive.window[1]}"
+    files = find_images(drive.of(PHOTOGRAPHS, camera, (PERSPECTIVE | FISHEYE)[camera]))
+    return [(int(file.stem), file) for file in files if re.fullmatch(r"[0-9]{1,10}", file.stem)]
 
 
 def _notes(drive: Drive, cameras: tuple[str, ...], *, left_out: int) -> list[str]:
@@ -185,52 +414,41 @@ def _notes(drive: Drive, cameras: tuple[str, ...], *, left_out: int) -> list[str
 def _intrinsics(drive: Drive, camera: str) -> Intrinsics:
     if camera in FISHEYE:
         return _fisheye(drive.root / "calibration" / f"{camera}.yaml")
-    path = drive.root / "calibration" / "perspective.txt"
-    rows, number = calibration_rows(path), camera[-2:]
+    path, number = drive.calibration("perspective.txt"), camera[-2:]
+    rows = read_keyed_numbers(path)
     projection = keyed_matrix(rows, f"P_rect_{number}", (3, 4), path=path)
-    size = keyed_matrix(rows, f"S_rect_{number}", (1, 2), path=path)[0]
+    width, height = keyed_matrix(rows, f"S_rect_{number}", (1, 2), path=path)[0]
     return Intrinsics(
         fx=float(projection[0, 0]),
         fy=float(projection[1, 1]),
         cx=float(projection[0, 2]) + _PIXEL_CENTRE,
         cy=float(projection[1, 2]) + _PIXEL_CENTRE,
-        width=round(float(size[0])),
-        height=round(float(size[1])),
+        width=round(float(width)),
+        height=round(float(height)),
     )
 
 
 def _fisheye(path: Path) -> Intrinsics:
     """The lens of a YAML file as OpenCV writes it, of which the rows ``key: number`` count."""
-    values = _yaml_numbers(path)
-    lacking = [key for key in (*_SIZE, *_LENS, *_PROJECTION) if key not in values]
-    if lacking:
-        raise FileFormatError(f"{path}: expected numbers {', '.join(lacking)}, got none.")
-    return Intrinsics(
-        model="mei",
-        fx=values["gamma1"],
-        fy=values["gamma2"],
-        cx=values["u0"] + _PIXEL_CENTRE,
-        cy=values["v0"] + _PIXEL_CENTRE,
-        distortion=tuple(values[key] for key in _LENS),
-        width=round(values["image_width"]),
-        height=round(values["image_height"]),
-    )
-
-
-def _yaml_numbers(path: Path) -> Mapping[str, float]:
     if not path.is_file():
         raise MissingFileError(f"{path}: expected the lens of a fisheye camera, got none.")
-    found: dict[str, float] = {}
-    for line in read_lines(path, "the lens of a fisheye camera"):
-        key, _, word = line.partition(":")
-        try:
-            value = float(word)
-        except ValueError:
-            continue
-        if not np.isfinite(value):
-            raise FileFormatError(f"{path}: expected finite numbers, got {quoted(line)}.")
-        found[key.strip()] = value
-    return found
+    rows = read_keyed_numbers(path)
+    lacking = [key for key in _FISHEYE_KEYS if key not in rows or rows[key].size != 1]
+    if lacking:
+        raise malformed(path, f"numbers {', '.join(lacking)}, got none")
+    values = [float(rows[key][0]) for key in _FISHEYE_KEYS]
+    expect(np.isfinite(values).all(), path, "finite numbers, got NaN or infinity")
+    fx, fy, cx, cy, width, height, *distortion = values
+    return Intrinsics(
+        model="mei",
+        fx=fx,
+        fy=fy,
+        cx=cx + _PIXEL_CENTRE,
+        cy=cy + _PIXEL_CENTRE,
+        distortion=tuple(distortion),
+        width=round(width),
+        height=round(height),
+    )
 
 
 def _start_points(drive: Drive, frames: list[int]) -> PointCloud | None:

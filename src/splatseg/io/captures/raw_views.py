@@ -1,7 +1,7 @@
 """What a layout says of a photograph: where it is, its lens and its pose, and the camera of it."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeAlias
@@ -11,12 +11,10 @@ import torch
 from numpy.typing import NDArray
 
 from splatseg.core import Camera, CameraModel
-from splatseg.core.json_numbers import MAX_NUMBER
+from splatseg.core.json_values import MAX_NUMBER
 from splatseg.errors import InputError, quoted
 from splatseg.io.images import same_shape
-
-MAX_SIDE = 1 << 24
-"""Pixels a side of a picture that a layout may speak of."""
+from splatseg.io.schema import MAX_SIDE
 
 _ROTATION_TOLERANCE = 1e-3
 
@@ -84,32 +82,26 @@ def scaled_to(intrinsics: Intrinsics, size: tuple[int, int], *, where: str) -> I
     Raises:
         InputError: If no uniform scale leads from one size to the other.
     """
-    if intrinsics.width is None or intrinsics.height is None:
+    width, height = intrinsics.width, intrinsics.height
+    if width is None or height is None:
         return replace(intrinsics, width=size[0], height=size[1])
-    if not (1 <= intrinsics.width <= MAX_SIDE and 1 <= intrinsics.height <= MAX_SIDE):
+    if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
+        got = f"{quoted(width)}x{quoted(height)}"
         raise InputError(
-            f"{where}: expected intrinsics of 1 to {MAX_SIDE} pixels a side, got "
-            f"{quoted(intrinsics.width)}x{quoted(intrinsics.height)}."
+            f"{where}: expected intrinsics of 1 to {MAX_SIDE} pixels a side, got {got}."
         )
-    if (intrinsics.width, intrinsics.height) == size:
+    if (width, height) == size:
         return intrinsics
-    if not same_shape(intrinsics.width, intrinsics.height, *size):
-        turned = same_shape(intrinsics.height, intrinsics.width, *size)
+    if not same_shape(width, height, *size):
+        turned = same_shape(height, width, *size)
         hint = "; turned by its EXIF orientation, perhaps" if turned else ""
         raise InputError(
-            f"{where}: expected a photograph of {intrinsics.width}x{intrinsics.height} pixels or a "
-            f"uniform scale of it, as its intrinsics say, got {size[0]}x{size[1]}{hint}."
+            f"{where}: expected a photograph of {width}x{height} pixels or a uniform scale of it, "
+            f"as its intrinsics say, got {size[0]}x{size[1]}{hint}."
         )
-    sx, sy = size[0] / intrinsics.width, size[1] / intrinsics.height
-    return replace(
-        intrinsics,
-        width=size[0],
-        height=size[1],
-        fx=intrinsics.fx * sx,
-        fy=intrinsics.fy * sy,
-        cx=intrinsics.cx * sx,
-        cy=intrinsics.cy * sy,
-    )
+    sx, sy = size[0] / width, size[1] / height
+    fx, fy, cx, cy = intrinsics.fx * sx, intrinsics.fy * sy, intrinsics.cx * sx, intrinsics.cy * sy
+    return replace(intrinsics, width=size[0], height=size[1], fx=fx, fy=fy, cx=cx, cy=cy)
 
 
 def checked_pose(pose: NDArray[np.float64], *, where: str) -> NDArray[np.float64]:
@@ -143,6 +135,20 @@ def checked_pose(pose: NDArray[np.float64], *, where: str) -> NDArray[np.float64
     return exact
 
 
+def inverse_pose(world_from_cam: NDArray[np.float64], *, where: str) -> NDArray[np.float64]:
+    """cam_from_world of a finite 4 x 4 pose of a camera with OpenCV axes.
+
+    Raises:
+        InputError: If it is singular or not finite.
+    """
+    if not np.isfinite(world_from_cam).all():
+        raise InputError(f"{where}: expected a finite pose, got NaN or infinity.")
+    try:
+        return np.linalg.inv(world_from_cam).astype(np.float64)
+    except np.linalg.LinAlgError as error:
+        raise InputError(f"{where}: expected a pose, got a singular matrix.") from error
+
+
 def opencv_from_opengl(world_from_cam: NDArray[np.float64]) -> NDArray[np.float64]:
     """cam_from_world with OpenCV axes from world_from_cam with OpenGL axes (y up, z back).
 
@@ -157,6 +163,21 @@ def opencv_from_opengl(world_from_cam: NDArray[np.float64]) -> NDArray[np.float6
         return world_from_cam
 
 
+def pose_of_quaternion(values: Sequence[float]) -> NDArray[np.float64]:
+    """4 x 4 transform of qw qx qy qz tx ty tz; a zero quaternion gives NaN, found later."""
+    w, x, y, z = values[:4]
+    length = math.hypot(w, x, y, z)
+    w, x, y, z = (v / length if 0 < length < math.inf else float("nan") for v in (w, x, y, z))
+    matrix = np.eye(4)
+    matrix[:3, :3] = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    matrix[:3, 3] = values[4:7]
+    return matrix
+
+
 def camera_of(
     view: RawView, intrinsics: Intrinsics, size: tuple[int, int], *, where: str
 ) -> Camera:
@@ -165,8 +186,7 @@ def camera_of(
     Raises:
         InputError: If its pose or its lens is one that no camera has; `where` starts the message.
     """
-    for name in ("fx", "fy"):
-        value = float(getattr(intrinsics, name))
+    for name, value in (("fx", intrinsics.fx), ("fy", intrinsics.fy)):
         if not (math.isfinite(value) and value > 0):
             raise InputError(f"{where}: expected a positive focal length, got {name} = {value:g}.")
     rest = (intrinsics.cx, intrinsics.cy, *intrinsics.distortion)

@@ -4,6 +4,7 @@ Its photographs are JPEG files inside of Parquet. Everything that reads photogra
 they are unpacked once, byte for byte, into ROOT/photographs/CONTEXT; see `unpack_photographs`.
 """
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatseg.core import Capture
-from splatseg.errors import FileFormatError, MissingFileError, SplatsegError
+from splatseg.errors import SplatsegError
 from splatseg.io.atomic import atomic_folder, sweep
 from splatseg.io.captures.build import build_capture
-from splatseg.io.captures.raw_views import MAX_SIDE, Intrinsics, RawView
-from splatseg.io.captures.replica import inverse_pose
+from splatseg.io.captures.raw_views import Intrinsics, RawView, inverse_pose
 from splatseg.io.captures.waymo_segment import (
+    CAMERA_POSE,
     CAMERAS,
     IMAGES,
     SUFFIX,
@@ -27,11 +28,12 @@ from splatseg.io.captures.waymo_segment import (
     one_segment,
     transform,
 )
-from splatseg.io.captures.waymo_tfrecord import ENDING
+from splatseg.io.captures.waymo_tfrecord import ENDING, LENS
 from splatseg.io.foreign import is_file
 from splatseg.io.json_files import read_json, write_json
 from splatseg.io.parquet import RowReader, bytes_of, integer_of, number_of, read_rows
 from splatseg.io.paths import path_inside
+from splatseg.io.schema import MAX_SIDE, expect
 
 CALIBRATIONS = "camera_calibration"
 PHOTOGRAPHS = "photographs"
@@ -42,9 +44,7 @@ TEST_EVERY = 5
 
 CAMERA = "key.camera_name"
 _IMAGE = "[CameraImageComponent].image"
-_POSE = "[CameraImageComponent].pose.transform"
 _CALIBRATION = "[CameraCalibrationComponent]"
-_LENS = ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3")
 _RECORD = "source.json"
 
 # Waymo's cameras look along x, with y left and z up; OpenCV's x is right, y down, z forward.
@@ -83,7 +83,7 @@ def read_waymo(path: Path, *, strict: bool = False) -> Capture:
     segment.needed(IMAGES, CALIBRATIONS)
     calibrations = _calibrations(segment)
     file = segment.component(IMAGES)
-    rows = read_rows(file, (TIMESTAMP, CAMERA, _POSE))
+    rows = read_rows(file, (TIMESTAMP, CAMERA, CAMERA_POSE))
     keys = [
         (integer_of(row, TIMESTAMP, where=file), integer_of(row, CAMERA, where=file))
         for row in rows
@@ -93,12 +93,10 @@ def read_waymo(path: Path, *, strict: bool = False) -> Capture:
     raw: list[RawView] = []
     for row, (time, camera) in zip(rows, keys, strict=True):
         where = f"{file}: frame {time}, camera {camera}"
-        if camera not in calibrations:
-            raise FileFormatError(
-                f"{where}: expected one of the cameras {sorted(calibrations)} of {CALIBRATIONS}."
-            )
+        known = f"one of the cameras {sorted(calibrations)} of {CALIBRATIONS}"
+        expect(camera in calibrations, where, known)
         lens, vehicle_from_camera = calibrations[camera]
-        pose = segment.placed(transform(row, _POSE, where=where)) @ vehicle_from_camera
+        pose = segment.placed(transform(row, CAMERA_POSE, where=where)) @ vehicle_from_camera
         raw.append(
             RawView(
                 image=folder / photograph_name(time, camera),
@@ -113,13 +111,16 @@ def read_waymo(path: Path, *, strict: bool = False) -> Capture:
         segment.origin_note,
         f"every {TEST_EVERY}th frame is a test view, with all of its cameras",
     ]
-    capture = build_capture(segment.root, raw, format="waymo", notes=notes, strict=strict)
-    return replace(
-        capture,
-        path=path if path.suffix in (SUFFIX, ENDING) else segment.root,
-        metres_per_unit=capture.metres_per_unit or 1.0,
-        up=capture.up or (0.0, 0.0, 1.0),
+    capture = build_capture(
+        segment.root,
+        raw,
+        format="waymo",
+        notes=notes,
+        metres_per_unit=1.0,
+        up=(0.0, 0.0, 1.0),
+        strict=strict,
     )
+    return replace(capture, path=path if path.suffix in (SUFFIX, ENDING) else segment.root)
 
 
 def photograph_name(time: int, camera: int) -> str:
@@ -150,11 +151,8 @@ def unpack_photographs(segment: WaymoSegment, keys: Sequence[tuple[int, int]]) -
     file = segment.component(IMAGES)
     folder = segment.root / PHOTOGRAPHS / segment.context
     names = [photograph_name(time, camera) for time, camera in keys]
-    if len(set(names)) != len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        raise FileFormatError(
-            f"{file}: expected one photograph a frame and camera, got {twice} twice."
-        )
+    twice = next((name for name, count in Counter(names).items() if count > 1), None)
+    expect(twice is None, file, f"one photograph a frame and camera, got {twice} twice")
     size = file.stat().st_size
     if _unpacked_size(folder) == size and all(is_file(folder / name) for name in names):
         return folder
@@ -173,7 +171,7 @@ def _unpacked_size(folder: Path) -> int | None:
     """Bytes of the component that a folder was unpacked from, None where it is not known."""
     try:
         size: object = read_json(folder / _RECORD).get("bytes")
-    except (SplatsegError, MissingFileError):
+    except SplatsegError:
         return None
     return size if isinstance(size, int) else None
 
@@ -181,7 +179,7 @@ def _unpacked_size(folder: Path) -> int | None:
 def _calibrations(segment: WaymoSegment) -> dict[int, tuple[Intrinsics, NDArray[np.float64]]]:
     """Lens and vehicle_from_camera of each camera."""
     path = segment.component(CALIBRATIONS)
-    numbers = [f"{_CALIBRATION}.intrinsic.{name}" for name in _LENS]
+    numbers = [f"{_CALIBRATION}.intrinsic.{name}" for name in LENS]
     sides = [f"{_CALIBRATION}.{name}" for name in ("width", "height")]
     extrinsic = f"{_CALIBRATION}.extrinsic.transform"
     found: dict[int, tuple[Intrinsics, NDArray[np.float64]]] = {}
@@ -190,8 +188,8 @@ def _calibrations(segment: WaymoSegment) -> dict[int, tuple[Intrinsics, NDArray[
         where = f"{path}: camera {camera}"
         fx, fy, cx, cy, *distortion = (number_of(row, name, where=where) for name in numbers)
         width, height = (integer_of(row, name, where=where) for name in sides)
-        if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
-            raise FileFormatError(f"{where}: expected 1 to {MAX_SIDE} pixels a side, got others.")
+        sound = 1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE
+        expect(sound, where, f"1 to {MAX_SIDE} pixels a side, got others")
         lens = Intrinsics(
             model="opencv",
             fx=fx,

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatseg.core import ClassInfo, ClassTable
-from splatseg.errors import FileFormatError, InputError, MissingFileError
+from splatseg.errors import InputError, MissingFileError
 from splatseg.io.captures.raw_views import checked_pose
 from splatseg.io.captures.waymo_tfrecord import (
     ENDING,
@@ -24,12 +24,14 @@ from splatseg.io.captures.waymo_tfrecord import (
 )
 from splatseg.io.foreign import is_file
 from splatseg.io.parquet import Row, integer_of, list_of, read_rows
+from splatseg.io.schema import expect
 
 IMAGES = "camera_image"
 LIDAR = "lidar"
 BOXES = "lidar_box"
 VEHICLE_POSES = "vehicle_pose"
 SUFFIX = ".parquet"
+CAMERA_POSE = "[CameraImageComponent].pose.transform"
 TIMESTAMP = "key.frame_timestamp_micros"
 MICROSECOND = 1e-6
 """Seconds of the unit of timestamps: scans, views and boxes have their times by one product."""
@@ -47,12 +49,8 @@ _LIDAR_STUFF = frozenset(
 
 
 def _table(names: tuple[str, ...], stuff: frozenset[str]) -> ClassTable:
-    return ClassTable(
-        rows=tuple(
-            ClassInfo(id=id, name=name, isthing=name not in stuff)
-            for id, name in enumerate(names, start=1)
-        )
-    )
+    rows = (ClassInfo(id=i, name=n, isthing=n not in stuff) for i, n in enumerate(names, start=1))
+    return ClassTable(rows=tuple(rows))
 
 
 CAMERA_CLASSES = _table(
@@ -121,8 +119,10 @@ class WaymoSegment:
             InputError: If a pose is none.
         """
         self.needed(VEHICLE_POSES)
-        path = self.component(VEHICLE_POSES)
-        column = "[VehiclePoseComponent].world_from_vehicle.transform"
+        return self._poses(VEHICLE_POSES, "[VehiclePoseComponent].world_from_vehicle.transform")
+
+    def _poses(self, component: str, column: str) -> dict[int, NDArray[np.float64]]:
+        path = self.component(component)
         return {
             integer_of(row, TIMESTAMP, where=path): transform(row, column, where=f"{path}: row {i}")
             for i, row in enumerate(read_rows(path, (TIMESTAMP, column)))
@@ -138,17 +138,9 @@ class WaymoSegment:
         Raises:
             InputError: If no pose is there, or the first is none.
         """
-        if self.has(VEHICLE_POSES):
-            poses = self.vehicle_poses
-        else:
-            path = self.component(IMAGES)
-            column = "[CameraImageComponent].pose.transform"
-            poses = {
-                integer_of(row, TIMESTAMP, where=path): transform(row, column, where=path)
-                for row in read_rows(path, (TIMESTAMP, column))
-            }
-        if not poses:
-            raise FileFormatError(f"{self.root}: expected poses of {self.context}, got none.")
+        by_vehicle = self.has(VEHICLE_POSES)
+        poses = self.vehicle_poses if by_vehicle else self._poses(IMAGES, CAMERA_POSE)
+        expect(poses, self.root, f"poses of {self.context}, got none")
         first = np.asarray(poses[min(poses)], np.float64)[:3, 3]
         return np.round(first / _KILOMETRE) * _KILOMETRE + 0.0  # no -0
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from splatseg.core import FeatureMap, MaskSet, Rle
-from splatseg.core.json_numbers import json_integer, json_number
+from splatseg.core.json_values import json_integer, json_number
 from splatseg.errors import FileFormatError, InputError, quoted, reason
 from splatseg.io.evidence._base import EvidenceKind, IdFreeEvidence, refuse
 from splatseg.io.evidence._label_files import read_id_map

@@ -20,7 +20,7 @@ from splatseg.core import (
     Track,
     map_ids,
 )
-from splatseg.core.json_numbers import json_integer, json_number
+from splatseg.core.json_values import json_integer, json_number
 from splatseg.errors import FileFormatError, quoted
 from splatseg.io.evidence._base import MAX_FILE_ID, Evidence, EvidenceKind, is_id, refuse
 from splatseg.io.evidence._labels import LabelEvidence, masks_of_ids

@@ -16,7 +16,7 @@ from typing import Any, cast
 import torch
 
 from splatseg.core.boundary import boundary
-from splatseg.core.json_numbers import json_matrix, json_number
+from splatseg.core.json_values import json_matrix, json_number
 from splatseg.core.moving import MovingBox
 from splatseg.errors import FileFormatError, quoted
 from splatseg.io.foreign import made_from

@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from splatseg.core.moving import MovingBox
 from splatseg.core.rigid import quaternion_from_rotation
 from splatseg.errors import FileFormatError, MissingFileError
-from splatseg.io.captures.kitti360_drive import SCANS, VELODYNE, Drive, find_drive
+from splatseg.io.captures.kitti360 import SCANS, VELODYNE, Drive, find_drive
 from splatseg.io.foreign import is_file, made_from
 from splatseg.io.moving._opencv_storage import StoredObject, stored_objects
 from splatseg.io.moving._times import Clock
-from splatseg.io.timestamps import frame_time, read_times
+from splatseg.io.text_numbers import frame_time, read_times
 
 FOLDER = "data_3d_bboxes"
 _SPLITS = ("train_full", "train")

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from splatseg.core.json_numbers import MAX_NUMBER
+from splatseg.core.json_values import MAX_NUMBER
 from splatseg.errors import FileFormatError, quoted, reason
 from splatseg.io.xml_files import read_xml
 

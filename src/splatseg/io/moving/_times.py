@@ -6,14 +6,14 @@ from typing import Any, Literal, cast
 from splatseg._check import check_choice
 from splatseg.core import Capture, Scan
 from splatseg.core.boundary import boundary
-from splatseg.core.json_numbers import is_json_number
+from splatseg.core.json_values import is_json_number
 from splatseg.core.view_names import frame_number
 from splatseg.errors import InputError
-from splatseg.io.captures.kitti360_drive import SCANS, VELODYNE, find_drive
+from splatseg.io.captures.kitti360 import SCANS, VELODYNE, find_drive
 from splatseg.io.captures.nerfstudio import FILE
 from splatseg.io.captures.waymo_segment import MICROSECOND
 from splatseg.io.json_files import read_json
-from splatseg.io.timestamps import frame_time, read_times
+from splatseg.io.text_numbers import frame_time, read_times
 
 Clock = Literal["recorded", "frames"]
 """What times are. recorded: what the data set has, such as seconds, else frames. frames: the last

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from splatseg.core.json_numbers import MAX_NUMBER
+from splatseg.core.json_values import MAX_NUMBER
 from splatseg.core.moving import MovingBox
 from splatseg.core.rigid import quaternion_from_rotation
 from splatseg.errors import FileFormatError, quoted

@@ -13,7 +13,7 @@ from splatseg._check import check_choice
 from splatseg.core import ClassTable
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, MissingFileError
-from splatseg.io.captures.kitti360_drive import window_of
+from splatseg.io.captures.kitti360 import window_of
 from splatseg.io.scans._source import Scans as Scans
 from splatseg.io.scans.files import find_files, read_files
 from splatseg.io.scans.kitti import find_kitti_raw, read_kitti_raw

@@ -16,10 +16,9 @@ from scipy.spatial.transform import Rotation
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.io.captures.raw_views import checked_pose
 from splatseg.io.foreign import read_lines
-from splatseg.io.keyed_numbers import keyed_matrix, read_keyed_numbers, rigid
 from splatseg.io.scans._source import RawScan, Scans, only_one
 from splatseg.io.scans._velodyne import numbered_files, read_points, skipped
-from splatseg.io.timestamps import read_times
+from splatseg.io.text_numbers import keyed_matrix, read_keyed_numbers, read_times, rigid
 
 EARTH_RADIUS = 6378137.0
 """Metres, at the equator."""

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from splatseg.errors import FileFormatError, InputError, MissingFileError
-from splatseg.io.captures.kitti360 import static_windows
-from splatseg.io.captures.kitti360_drive import (
+from splatseg.io.captures.kitti360 import (
     ACCUMULATED,
     SCANS,
     SICK,
@@ -29,6 +28,7 @@ from splatseg.io.captures.kitti360_drive import (
     find_drive,
     read_poses,
     sick_pose,
+    static_windows,
     velodyne_pose,
 )
 from splatseg.io.label_tables import label_table
@@ -41,7 +41,7 @@ from splatseg.io.scans._velodyne import (
     skipped,
     unrolled,
 )
-from splatseg.io.timestamps import read_times
+from splatseg.io.text_numbers import read_times
 
 _MAX_GAP = 3
 """Frames between two poses, beyond which nobody knows how the car went from one to the other."""

@@ -18,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatseg.core import ClassInfo, ClassTable
-from splatseg.core.json_numbers import json_integer, json_number
+from splatseg.core.json_values import json_integer, json_number
 from splatseg.errors import FileFormatError, MissingFileError, quoted
 from splatseg.io.captures.raw_views import checked_pose
 from splatseg.io.foreign import is_file
-from splatseg.io.json_rows import read_json_rows
+from splatseg.io.json_files import read_json_rows
 from splatseg.io.paths import path_inside
 from splatseg.io.scans._records import read_ids, read_records
 from splatseg.io.scans._source import RawScan, Scans, only_one

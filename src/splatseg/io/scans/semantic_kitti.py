@@ -17,12 +17,11 @@ from numpy.typing import NDArray
 
 from splatseg.errors import InputError, MissingFileError
 from splatseg.io.captures.raw_views import checked_pose
-from splatseg.io.keyed_numbers import keyed_matrix, read_keyed_numbers, rigid
 from splatseg.io.label_tables import label_table
 from splatseg.io.scans._records import read_ids
 from splatseg.io.scans._source import RawScan, Scans, only_one
 from splatseg.io.scans._velodyne import numbered_files, read_points, skipped
-from splatseg.io.text_numbers import read_numbers
+from splatseg.io.text_numbers import keyed_matrix, read_keyed_numbers, read_numbers, rigid
 
 _VOID = frozenset({0, 1})
 """unlabeled and outlier."""

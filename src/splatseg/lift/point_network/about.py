@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar, cast, get_args
 
 from splatseg.core import JSON
-from splatseg.core.json_numbers import is_json_number
+from splatseg.core.json_values import is_json_number
 from splatseg.errors import FileFormatError, quoted
 from splatseg.io.foreign import made_from
 from splatseg.io.json_files import json_text, parse_object

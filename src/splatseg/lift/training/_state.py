@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splatseg.core.boundary import boundary
-from splatseg.core.json_numbers import json_integer, json_number
+from splatseg.core.json_values import json_integer, json_number
 from splatseg.core.recorded_options import DIFFERENCES, differing_names, option_differences
 from splatseg.errors import FileFormatError, InputError, brief, quoted
 from splatseg.io.json_files import parse_object

@@ -11,7 +11,7 @@ import numpy as np
 
 from splatseg.core import Capture, PointCloud
 from splatseg.core.boundary import boundary
-from splatseg.core.json_numbers import is_json_number, json_matrix, json_number
+from splatseg.core.json_values import is_json_number, json_matrix, json_number
 from splatseg.errors import FileFormatError, InputError
 from splatseg.io.atomic import atomic_folder, is_vacant
 from splatseg.io.cameras import cameras_content

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatseg.core.boundary import boundary
-from splatseg.core.json_numbers import json_number
+from splatseg.core.json_values import json_number
 from splatseg.errors import FileFormatError, MissingFileError, quoted
 from splatseg.io.foreign import made_from
 from splatseg.io.json_files import json_text, read_json, write_json

@@ -27,7 +27,7 @@ from jaxtyping import Float, Int64
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splatseg.core.json_numbers import json_integer
+from splatseg.core.json_values import json_integer
 from splatseg.errors import FileFormatError, InputError, MissingFileError, quoted
 from splatseg.io.atomic import atomic_folder, is_vacant
 from splatseg.io.json_files import json_text, read_json

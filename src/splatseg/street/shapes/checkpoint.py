@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from splatseg.core.boundary import boundary
-from splatseg.core.json_numbers import is_json_number
-from splatseg.core.json_values import plain_object
+from splatseg.core.json_values import is_json_number, plain_object
 from splatseg.errors import FileFormatError, InputError, MissingFileError, quoted
 from splatseg.io.foreign import is_file, made_from
 from splatseg.io.json_files import json_text, parse_object

@@ -19,7 +19,7 @@ from splatseg.evaluate.protocols import (
 )
 from splatseg.io.benchmarks.replica import LAYOUT as REPLICA
 from splatseg.io.benchmarks.replica import SEQUENCES
-from splatseg.io.captures.replica import TRAIN_EVERY
+from splatseg.io.captures.pose_tables import TRAIN_EVERY
 from splatseg.io.paths import path_inside
 from splatseg.io.scans import scan_formats
 from splatseg.io.scene import load_scene

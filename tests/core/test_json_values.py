@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from splatseg.core.json_numbers import MAX_INTEGER, json_integer, json_matrix, json_number
+from splatseg.core.json_values import MAX_INTEGER, json_integer, json_matrix, json_number
 from splatseg.errors import FileFormatError
 
 
