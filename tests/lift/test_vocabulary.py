@@ -38,7 +38,7 @@ def recorded(width: int = 3) -> TextEmbeddings:
 def evidence(tmp_path) -> FeatureEvidence:
     folder = tmp_path / "words"
     folder.mkdir()
-    return FeatureEvidence(root=folder, files={})
+    return FeatureEvidence(folder=folder, files={})
 
 
 def test_recorded_words(evidence) -> None:

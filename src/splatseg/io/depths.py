@@ -8,11 +8,12 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from splatseg.core import DepthKind, DepthMap, View
-from splatseg.errors import FileFormatError, InputError
+from splatseg.errors import InputError
 from splatseg.io.foreign import reading
 from splatseg.io.images import open_image
 from splatseg.io.npy import read_npy
 from splatseg.io.npz import npz_names, read_npz
+from splatseg.io.schema import expect
 
 DEPTH_NAME = "depth"
 """The array of an npz that is a depth map of evidence."""
@@ -73,10 +74,8 @@ def _cleaned(
     """Depths times their unit, 0 where they are negative or not finite."""
     if values.ndim == 3 and values.shape[2] == 1:
         values = values[..., 0]
-    if values.ndim != 2 or values.size == 0:
-        raise FileFormatError(
-            f"{path}: expected a depth map of one channel, got shape {values.shape}."
-        )
+    single = values.ndim == 2 and values.size
+    expect(single, path, f"a depth map of one channel, got shape {values.shape}")
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite becomes 0
         depth = values.astype(np.float32) * np.float32(unit)
     depth[~(np.isfinite(depth) & (depth > 0))] = 0
@@ -85,38 +84,30 @@ def _cleaned(
 
 def _values(path: Path) -> NDArray[np.generic]:
     if path.suffix == ".npz":
-        array = read_npz(path, [DEPTH_NAME])[DEPTH_NAME]
-        return _numbers(path, array)
-    return _numbers(path, read_npy(path)) if path.suffix == ".npy" else _image(path)
+        return _numbers(path, read_npz(path, [DEPTH_NAME])[DEPTH_NAME])
+    if path.suffix == ".npy":
+        return _numbers(path, read_npy(path))
+    with open_image(path) as image, reading(path, "an image of depths"):
+        return np.array(image)
 
 
 def _kind(path: Path) -> DepthKind:
     kind = read_npz(path, ["kind"])["kind"]
     word = str(kind) if kind.ndim == 0 and kind.dtype.kind == "U" else ""
-    if word not in _KINDS:
-        raise FileFormatError(f"{path}: expected kind metric or relative, got {word!r:.40}.")
+    expect(word in _KINDS, path, "kind metric or relative", word)
     return _KINDS[word]
 
 
 def _confidence(path: Path, shape: tuple[int, ...]) -> NDArray[np.float32]:
     found = _numbers(path, read_npz(path, ["confidence"])["confidence"])
-    if found.shape != shape:
-        raise FileFormatError(
-            f"{path}: expected a confidence of each of {shape[1]}x{shape[0]} depths, got shape "
-            f"{found.shape}."
-        )
+    what = f"a confidence of each of {shape[1]}x{shape[0]} depths, got shape {found.shape}"
+    expect(found.shape == shape, path, what)
     values = found.astype(np.float32)
-    if not bool(((values >= 0) & (values <= 1)).all()):
-        raise FileFormatError(f"{path}: expected confidences in [0, 1], got others.")
+    within = ((values >= 0) & (values <= 1)).all()
+    expect(within, path, "confidences in [0, 1], got others")
     return values
 
 
 def _numbers(path: Path, array: NDArray[np.generic]) -> NDArray[np.generic]:
-    if array.dtype.kind not in "biuf":
-        raise FileFormatError(f"{path}: expected a depth map of numbers, got text.")
+    expect(array.dtype.kind in "biuf", path, "a depth map of numbers, got text")
     return array
-
-
-def _image(path: Path) -> NDArray[np.generic]:
-    with open_image(path) as image, reading(path, "an image of depths"):
-        return np.array(image)

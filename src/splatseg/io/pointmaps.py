@@ -10,9 +10,9 @@ pair and work that was stopped goes on.
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,12 +21,13 @@ from torch import Tensor
 
 from splatseg.core.boundary import boundary
 from splatseg.core.models import Pointmap
-from splatseg.errors import FileFormatError, InputError, MissingFileError, quoted
+from splatseg.errors import InputError, MissingFileError, quoted
 from splatseg.io.atomic import atomic_file
 from splatseg.io.foreign import made_from
-from splatseg.io.json_files import read_json, write_json
+from splatseg.io.json_files import write_json
 from splatseg.io.npz import read_npz
 from splatseg.io.npz_writing import save_arrays
+from splatseg.io.schema import check_array, expect, read_structured
 from splatseg.io.write_errors import named_write_failures
 
 FORMAT = "splatseg-pointmaps"
@@ -38,6 +39,14 @@ _FILE = re.compile(r"(\d{1,9})_(\d{1,9})\.npz")
 _MAX_SIDE = 1 << 14
 _HALF_MAX = 60_000.0
 """Largest coordinate that is written as float16."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Header:
+    format: Any
+    version: Any
+    photographs: list[str]
+    metadata: dict[str, Any] = field(default_factory=dict[str, Any])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,11 +73,9 @@ class RecordedPointmaps:
             if match is None:
                 continue
             pair = int(match[1]), int(match[2])
-            if max(pair) >= len(self.photographs) or pair[0] == pair[1]:
-                raise FileFormatError(
-                    f"{path}: expected a pair of two of the {len(self.photographs)} photographs "
-                    f"of {HEADER_FILE}, got {pair[0]} and {pair[1]}."
-                )
+            what = f"a pair of two of the {len(self.photographs)} photographs of {HEADER_FILE}"
+            known = max(pair) < len(self.photographs) and pair[0] != pair[1]
+            expect(known, path, f"{what}, got {pair[0]} and {pair[1]}")
             found.append(pair)
         names = self.photographs
         return tuple((names[i], names[j]) for i, j in sorted(found))
@@ -142,13 +149,8 @@ def create_pointmaps(
             )
         return there
     folder.mkdir(parents=True, exist_ok=True)
-    header = {
-        "format": FORMAT,
-        "version": VERSION,
-        "photographs": list(names),
-        "metadata": dict(metadata),
-    }
-    write_json(header, folder / HEADER_FILE)
+    header = {"format": FORMAT, "version": VERSION, "photographs": list(names)}
+    write_json(header | {"metadata": dict(metadata)}, folder / HEADER_FILE)
     return RecordedPointmaps(folder=folder, photographs=names, metadata=dict(metadata))
 
 
@@ -163,25 +165,13 @@ def open_pointmaps(folder: Path) -> RecordedPointmaps:
     path = folder / HEADER_FILE
     if not path.is_file():
         raise MissingFileError(f"{folder}: expected a folder of pointmaps, with {HEADER_FILE}.")
-    header = read_json(path)
-    if header.get("format") != FORMAT or header.get("version") != VERSION:
-        raise FileFormatError(
-            f"{path}: expected format {FORMAT!r} of version {VERSION}, got "
-            f"{quoted(header.get('format'))} of version {quoted(header.get('version'))}."
-        )
-    names, metadata = header.get("photographs"), header.get("metadata", {})
-    if not isinstance(names, list) or not all(
-        isinstance(name, str) for name in cast("list[object]", names)
-    ):
-        raise FileFormatError(f"{path}: expected photographs as a list of file names.")
-    listed = tuple(cast("list[str]", names))
-    if len(set(listed)) != len(listed):
-        raise FileFormatError(f"{path}: expected distinct photographs, got one twice.")
-    if not isinstance(metadata, dict):
-        raise FileFormatError(f"{path}: expected metadata as an object, got {quoted(metadata)}.")
-    return RecordedPointmaps(
-        folder=folder, photographs=listed, metadata=cast("dict[str, Any]", metadata)
-    )
+    header = read_structured(path, _Header)
+    known = header.format == FORMAT and header.version == VERSION
+    what = f"format {FORMAT!r} of version {VERSION}"
+    expect(known, path, f"{what}, got {quoted(header.format)} of version {quoted(header.version)}")
+    names = tuple(header.photographs)
+    expect(len(set(names)) == len(names), path, "distinct photographs, got one twice")
+    return RecordedPointmaps(folder=folder, photographs=names, metadata=header.metadata)
 
 
 def holds_pointmaps(folder: Path) -> bool:
@@ -195,16 +185,10 @@ def _pointmap(path: Path, points: NDArray[Any], confidence: NDArray[Any], which:
     Raises:
         FileFormatError: If they are none.
     """
-    if points.dtype.kind != "f" or confidence.dtype.kind != "f":
-        raise FileFormatError(
-            f"{path}: expected map {which} as real numbers, got {points.dtype} and "
-            f"{confidence.dtype}."
-        )
-    if points.ndim != 3 or not all(1 <= side <= _MAX_SIDE for side in points.shape[:2]):
-        raise FileFormatError(
-            f"{path}: expected points_{which} of shape (rows, columns, 3) with 1 to {_MAX_SIDE} "
-            f"a side, got {points.shape}."
-        )
+    shape = check_array(path, f"points_{which}", points, ("rows", "columns", 3), "f").shape
+    sides = all(1 <= side <= _MAX_SIDE for side in shape[:2])
+    expect(sides, path, f"points_{which} of 1 to {_MAX_SIDE} a side, got {shape}")
+    check_array(path, f"confidence_{which}", confidence, shape[:2], "f")
     with made_from(path):
         return Pointmap(
             points=torch.from_numpy(points.astype(np.float32)),

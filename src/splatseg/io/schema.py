@@ -49,10 +49,10 @@ _MISSING = re.compile(r"^Object missing required field `(.*)`$")
 _WORDS = (
     (r"Invalid enum value .*", "expected one of the words that are known"),
     (r"Number out of range", "expected a number that can be held"),
-    (r" (of length )?>= (\d+)(\.0)?$", r" \1of at least \2"),
-    (r" (of length )?<= (\d+)(\.0)?$", r" \1of at most \2"),
-    (r" > (\d+)(\.0)?$", r" above \1"),
-    (r" < (\d+)(\.0)?$", r" below \1"),
+    (r" (of length )?>= (-?[\d.]+?)(\.0)?$", r" \1of at least \2"),
+    (r" (of length )?<= (-?[\d.]+?)(\.0)?$", r" \1of at most \2"),
+    (r" > (-?[\d.]+?)(\.0)?$", r" above \1"),
+    (r" < (-?[\d.]+?)(\.0)?$", r" below \1"),
     ("of length of", "of length"),
     ("`int`", "a whole number"),
     (r"`(int \| )?float`", "a number"),
@@ -131,19 +131,20 @@ def read_structured(path: Path, kind: type[T]) -> T:
     return structured(read_json_value(path), kind, where=path)
 
 
-def structured(value: object, kind: type[T], *, where: object) -> T:
+def structured(value: object, kind: type[T], *, where: object, strict: bool = True) -> T:
     """A value of a file as the declared type.
 
     Args:
         value: What JSON gave.
         kind: A dataclass, or any type that `msgspec.convert` knows.
         where: File, and place in it, which start the message of an error.
+        strict: Without, numbers may be text, as in XML.
 
     Raises:
         FileFormatError: If it is not of this form, with the place, what is expected and what came.
     """
     try:
-        found = _converted(value, kind)
+        found = _converted(value, kind, strict=strict)
     except msgspec.ValidationError as error:
         raise FileFormatError(_sentence(value, kind, str(error), where)) from error
     check = _finite(kind)
@@ -152,13 +153,13 @@ def structured(value: object, kind: type[T], *, where: object) -> T:
     return found
 
 
-def _converted(value: object, kind: type[T]) -> T:
+def _converted(value: object, kind: type[T], *, strict: bool = True) -> T:
     try:
-        return msgspec.convert(value, kind)
+        return msgspec.convert(value, kind, strict=strict)
     except msgspec.ValidationError as error:
         if "got `float`" not in str(error):
             raise
-    return msgspec.convert(_with_whole_numbers(value), kind)
+    return msgspec.convert(_with_whole_numbers(value), kind, strict=strict)
 
 
 def _with_whole_numbers(value: Any) -> Any:
@@ -236,7 +237,7 @@ def _sentence(value: object, kind: type[Any], message: str, where: object) -> st
     if "..." in steps:
         steps = _with_keys(value, kind, steps)
     shown = "".join(f"[{s}]" if s.isdigit() else f".{s}" for s in steps).removeprefix(".")
-    place = f"{where}: {shown}" if shown else str(where)
+    place = f"{where}{'' if shown.startswith('[') else ': '}{shown}" if shown else str(where)
     missing = _MISSING.match(what)
     if missing is not None:
         return f"{place}: expected a field {missing[1]}, got none."

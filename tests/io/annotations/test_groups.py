@@ -104,7 +104,7 @@ def test_results_of_one_id_are_one_area_with_its_label(tmp_path: Path) -> None:
         found = open_annotations(path, views=VIEWS)
         assert isinstance(found, AnnotationEvidence)
         assert len(found.masks("000")) == 1
-        assert int(found.given("labels").label_map("000").ids.max()) == 1
+        assert int(found.as_kind("labels").label_map("000").ids.max()) == 1
 
 
 def test_soft_edges_of_a_brush_count_from_half(tmp_path: Path) -> None:

@@ -58,8 +58,8 @@ def read(path: Path) -> None:
     found = open_annotations(path, views=VIEWS)
     assert isinstance(found, AnnotationEvidence)
     found.masks("000")
-    found.given("labels").label_map("000")
-    found.given("panoptic").segments("000")
+    found.as_kind("labels").label_map("000")
+    found.as_kind("panoptic").segments("000")
 
 
 def refused(path: Path, *, message: str) -> None:
@@ -86,36 +86,36 @@ ZIGZAG = [value for i in range(20_000) for value in (i % 64, 48 * (i % 2))]
     ("change", "message"),
     [
         (runs([3000, 100]), "add up to 48 x 64"),
-        (runs([3072, 2**40]), "up to 4294967295, got 1099511627776"),
+        (runs([3072, 2**40]), "at most 4294967295, got 1099511627776"),
         (runs([2**32 - 1] * 9), "add up to 48 x 64"),
-        (runs([-3072, 6144]), "whole numbers up to"),
-        (runs([3072, None]), "whole numbers up to .*, got None"),
+        (runs([-3072, 6144]), "whole number of at least 0"),
+        (runs([3072, None]), "a whole number, got None"),
         (runs("~~"), "other characters"),
         (runs("o" * 1000), "breaks off|32 bits"),
         (runs([3072], [480, 640]), "size .48, 64., got .480, 640."),
-        (runs({"a": 1}), "run lengths"),
+        (runs({"a": 1}), "counts: expected text or a list"),
         (annotation(segmentation=[[1, 2, 3, 4]]), "three corners"),
         (annotation(segmentation=[TRIANGLE[:5]]), "three corners"),
-        (annotation(segmentation=[[*TRIANGLE, float("nan"), 1]]), "finite numbers .* got nan"),
-        (annotation(segmentation=[[*TRIANGLE, 10**400, 1]]), "finite numbers .* got a number of"),
-        (annotation(segmentation=[[*TRIANGLE, None, 1]]), "finite numbers .* got None"),
-        (annotation(segmentation=[[*TRIANGLE, "1", 1]]), "finite numbers .* got '1'"),
-        (annotation(segmentation=[{"x": 1}]), "three corners"),
-        (annotation(category_id=2**40), "no category 1099511627776"),
-        (annotation(category_id=None), "category_id: expected a whole number"),
+        (annotation(segmentation=[[*TRIANGLE, float("nan"), 1]]), "finite number up to .* got nan"),
+        (annotation(segmentation=[[*TRIANGLE, 10**400, 1]]), "that can be held, got a number of"),
+        (annotation(segmentation=[[*TRIANGLE, None, 1]]), "expected a number, got None"),
+        (annotation(segmentation=[[*TRIANGLE, "1", 1]]), "expected a number, got '1'"),
+        (annotation(segmentation=[{"x": 1}]), "segmentation.0.: expected a list"),
+        (annotation(category_id=2**40), "category_id, got 1099511627776"),
+        (annotation(category_id=None), "category_id, got none"),
         (annotation(image_id=2**40), "image_id 1099511627776, which it does not list"),
-        (annotation(image_id=[1]), "id of an image, got .1."),
+        (annotation(image_id=[1]), "image_id: expected a whole number or text"),
         (annotation(score=float("nan")), "score: expected a finite number"),
         (annotation(segmentation=[]), "1 boxes without any"),
         (lambda c: c["images"][0].update(width=640), "64x48 pixels as the photograph .* 640x48"),
         (lambda c: c["images"][0].update(width=2**40), "width: expected a whole number"),
-        (lambda c: c["images"][0].update(file_name=7), "expected a file_name, got 7"),
+        (lambda c: c["images"][0].update(file_name=7), "file_name: expected text, got 7"),
         (lambda c: c["images"].append(c["images"][0] | {"id": 2}), "one picture a view"),
         (lambda c: c["images"][0].update(file_name="../../etc/passwd"), "got none of them but 1"),
         (lambda c: c["categories"][0].update(id=-1), "id: expected a whole number"),
-        (lambda c: c["categories"][0].update(name=""), "expected a name, got ''"),
-        (lambda c: c.update(annotations=[3]), "list of objects as annotations"),
-        (lambda c: c.update(images={}), "list of objects as images"),
+        (lambda c: c["categories"][0].update(name=""), "name: expected text of length at least 1"),
+        (lambda c: c.update(annotations=[3]), "annotations.0.: expected an object"),
+        (lambda c: c.update(images={}), "images: expected a list"),
     ],
 )  # fmt: skip
 def test_coco(tmp_path: Path, change: Change, message: str) -> None:
@@ -169,9 +169,15 @@ def test_many_corners_are_read(tmp_path: Path) -> None:
     [
         (lambda c: c["annotations"][0].update(file_name="../000.png"), "name of a file below it"),
         (lambda c: c["annotations"][0].update(file_name="/etc/passwd"), "name of a file below it"),
-        (lambda c: c["annotations"][0].update(file_name="a" * 5000), "file_name of a PNG"),
+        (
+            lambda c: c["annotations"][0].update(file_name="a" * 5000),
+            "file_name: expected text",
+        ),
         (lambda c: c["annotations"][0].update(file_name="gone.png"), "no such image"),
-        (lambda c: c["annotations"][0].update(segments_info=[{"id": "1"}]), "id of a segment"),
+        (
+            lambda c: c["annotations"][0].update(segments_info=[{"id": "1"}]),
+            "id: expected a whole number",
+        ),
         (lambda c: c["annotations"][0]["segments_info"][0].pop("category_id"), "category_id"),
         (lambda c: c["annotations"][0]["segments_info"].append(3), "segments_info"),
     ],
@@ -204,14 +210,14 @@ def test_panoptic_pictures(tmp_path: Path, size: tuple[int, int], mode: str, mes
         (lambda s: s[0].update(points=[[1, 2], [9, 3]]), "mask of 9x2 pixels as its corners say"),
         (lambda s: s[0].update(points=[[63, 2], [65, 3]]), "within 64x48 pixels, got one of 3x2"),
         (lambda s: s[0].update(points=[[1, 2]]), "the corners of its box"),
-        (lambda s: s[0].update(points=[[-1, 2], [1, 3]]), "whole number in"),
-        (lambda s: s[0].update(points=[[0, 0], [2**40, 1]]), "whole number in"),
+        (lambda s: s[0].update(points=[[-1, 2], [1, 3]]), "whole pixels"),
+        (lambda s: s[0].update(points=[[0, 0], [2**40, 1]]), "a mask of 1099511627777x2"),
         (lambda s: s[0].update(mask="not base64!"), "PNG in base64, but it cannot be read"),
         (lambda s: s[0].update(mask=base64.b64encode(b"GIF89a").decode()), "PNG in base64"),
-        (lambda s: s[1].update(points=[[1, 2], [3]]), "three corners, two finite numbers"),
+        (lambda s: s[1].update(points=[[1, 2], [3]]), "points.1.: expected a list of length 2"),
         (lambda s: s[1].update(points=[[1, 2], [3, float("inf")], [4, 5]]), "got inf"),
-        (lambda s: s[1].update(label=3), "expected a label and a shape_type"),
-        (lambda s: s.append("x"), "expected a label and a shape_type, got 'x'"),
+        (lambda s: s[1].update(label=3), "shapes.1..label: expected text"),
+        (lambda s: s.append("x"), "shapes.2.: expected an object, got 'x'"),
     ],
 )
 def test_labelme(tmp_path: Path, change: Change, message: str) -> None:
@@ -247,16 +253,19 @@ MASK = '<mask label="a" rle="{}" left="{}" top="{}" width="{}" height="{}"/>'
         (cvat(MASK.format("1, 3", 1, 1, 2, 3)), "add up to its box .* 4 pixels for one of 2x3"),
         (cvat(MASK.format("0, 6", 63, 1, 2, 3)), "got one of 2x3 at"),
         (cvat(MASK.format("0, 6", -1, 1, 2, 3)), "got one of 2x3 at"),
-        (cvat(MASK.format("1, x", 1, 1, 2, 3)), "rle: "),
-        (cvat(MASK.format("1, 9999999999999999999999", 1, 1, 2, 3)), "rle: "),
+        (cvat(MASK.format("1, x", 1, 1, 2, 3)), "rle.1.: expected a whole"),
+        (
+            cvat(MASK.format("1, 9999999999999999999999", 1, 1, 2, 3)),
+            "rle.1.: expected a whole",
+        ),
         (cvat(MASK.format("0, 4294967295", 0, 0, 65535, 65537)), "within the picture"),
-        (cvat(MASK.format("0, 6", 1, 1, "9" * 500, 3)), "width: expected a whole number"),
-        (cvat('<polygon label="a" points="1,2;3,nan;4,5"/>'), "finite numbers each, got nan"),
-        (cvat('<polygon label="a" points="1,2;3,b;4,5"/>'), "finite numbers each, got 'b'"),
+        (cvat(MASK.format("0, 6", 1, 1, "9" * 500, 3)), "its box within the picture"),
+        (cvat('<polygon label="a" points="1,2;3,nan;4,5"/>'), "finite numbers each, got others"),
+        (cvat('<polygon label="a" points="1,2;3,b;4,5"/>'), "finite numbers each, got other words"),
         (cvat('<polygon label="a" points=""/>'), "three corners"),
-        (cvat("", 'width="0" height="48"'), "width: expected 1 to"),
-        (cvat("", 'height="48"'), "width: expected a whole number, got ''"),
-        (cvat("").replace(' name="000.jpg"', ""), "expected a name, got none"),
+        (cvat("", 'width="0" height="48"'), "width: expected a whole number of at least 1"),
+        (cvat("", 'height="48"'), "expected a field width"),
+        (cvat("").replace(' name="000.jpg"', ""), "expected a field name"),
         ("<annotation/>", "boxes of Pascal VOC do not say"),
         ("<annotations><track id='0'/></annotations>", "CVAT for video; export the task as"),
         ("<annotations>", "cannot be read"),
@@ -288,9 +297,9 @@ HEAD = ((64 * 48 * 4, 32), (7, 5), (2, 4), (3, 4), (7, 4), (15, 4))
         (bits(*HEAD, (1, 1), (3, 2), (99, 16), (255, 8)), "breaks off inside a run"),
         (bits(*HEAD, (0, 1), (3, 2), (9999, 16), (255, 8)), "breaks off inside a run"),
         ([], "breaks off"),
-        ([256], "list of bytes"),
-        ("abc", "list of bytes"),
-        ([1.5], "list of bytes"),
+        ([256], "rle.*: expected a"),
+        ("abc", "rle.*: expected a"),
+        ([1.5], "rle.*: expected a"),
     ],
 )
 def test_brushes(tmp_path: Path, rle: object, message: str) -> None:
@@ -305,10 +314,10 @@ OUTLINE = {"value": {"points": [[0, 0], [50, 0], [50, 50]], "polygonlabels": ["a
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"image_rotation": 90}, "turned by 90 degrees"),
+        ({"image_rotation": 90}, "turned by 90"),
         ({"original_width": 2**40}, "original_width: expected a whole number"),
         ({"original_width": 63}, "64x48 pixels as the photograph"),
-        ({"value": {"points": [[0, 0], [1, None], [2, 2]]}}, "finite numbers"),
+        ({"value": {"points": [[0, 0], [1, None], [2, 2]]}}, "points.1..1.: expected a number"),
     ],
 )
 def test_label_studio(tmp_path: Path, change: dict[str, Any], message: str) -> None:
@@ -330,8 +339,12 @@ def test_label_studio(tmp_path: Path, change: dict[str, Any], message: str) -> N
         ("a.json", b"[" * 100_000, "cannot be parsed"),
         ("a.json", b'[{"id": 1, "annotation_id": 2, "lead_time": 3}]', "JSON-MIN"),
         ("a.json", b'[{"image_id": 1, "category_id": 2, "bbox": [], "score": 1}]', "without any"),
-        ("a.json", b'[{"image_id": 1, "category_id": 2}, 3]', "list of results, got 3"),
-        ("a.json", b'[{"image_id": 1, "category_id": 2}, null]', "list of results, got None"),
+        ("a.json", b'[{"image_id": 1, "category_id": 2}, 3]', ".1.: expected an object, got 3"),
+        (
+            "a.json",
+            b'[{"image_id": 1, "category_id": 2}, null]',
+            ".1.: expected an object",
+        ),
     ],
 )
 def test_what_is_not_read_says_what_to_export(

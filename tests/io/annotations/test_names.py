@@ -3,7 +3,7 @@
 import pytest
 
 from splatseg.errors import InputError
-from splatseg.io.annotations._names import matched, parts_of, view_name
+from splatseg.io.annotations._base import matched, parts_of, view_name
 from support.annotations import views_of
 
 VIEWS = views_of("left/000", "right/000", "left/001", "night.v2")

@@ -26,7 +26,7 @@ def test_coco_panoptic(tmp_path: Path, rng: np.random.Generator) -> None:
     evidence = open_annotations(tmp_path / "coco", views=views_of(*maps))
     assert isinstance(evidence, AnnotationEvidence)
     assert evidence.view_names == ("b", "empty", "left/a")
-    labels = evidence.given("labels")
+    labels = evidence.as_kind("labels")
     assert labels.classes is not None
     assert {row.id: row.name for row in labels.classes.rows} == {1: "chair", 9: "wall"}
     for name, ids in maps.items():

@@ -78,7 +78,7 @@ def test_label_studio_converted_to_coco_has_outlines_alone() -> None:
         assert len(masks) == 1
         check(masks.dense(0).numpy(), TRUTH[i, 0], outlined=True)
     assert isinstance(evidence, AnnotationEvidence)
-    labels = evidence.given("labels")
+    labels = evidence.as_kind("labels")
     assert labels.classes is not None
     assert [(row.id, row.name) for row in labels.classes.rows] == list(enumerate(CLASSES, 1))
     assert labels.source_ids == {1: 0, 2: 1, 3: 2}
@@ -99,7 +99,7 @@ def test_shapes_as_classes(name: str) -> None:
     """The names stay, and what lies on top hides the rest."""
     evidence = opened(name)
     assert isinstance(evidence, AnnotationEvidence)
-    evidence = evidence.given("labels")
+    evidence = evidence.as_kind("labels")
     assert evidence.classes is not None
     assert [(row.id, row.name) for row in evidence.classes.rows] == list(enumerate(CLASSES, 1))
     for i, view in enumerate(evidence.view_names):

@@ -132,7 +132,9 @@ def test_fisheye_cameras_have_the_unified_lens(root) -> None:
     assert camera.project(ahead)[0].tolist() == pytest.approx([8, 7.75])
     assert any("too wide" in note for note in capture.notes)
     (root / "calibration/image_02.yaml").write_text("%YAML:1.0\nimage_width: 16\nxi: oops\n")
-    with pytest.raises(FileFormatError, match=r"image_02.yaml: expected numbers gamma1, .*image_height, xi,"):
+    with pytest.raises(
+        FileFormatError, match=r"image_02.yaml: expected numbers gamma1, .*image_height, xi,"
+    ):
         read_capture(folder)
     (root / "calibration/image_02.yaml").unlink()
     with pytest.raises(MissingFileError, match="expected the lens of a fisheye camera"):

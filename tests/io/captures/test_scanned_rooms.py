@@ -77,7 +77,9 @@ def test_another_camera_of_replica(place, tmp_path, write_image) -> None:
     with pytest.raises(FileFormatError, match=r"cam_params.json: expected a field camera"):
         read_capture(tmp_path)
     path.write_text('{"camera": {"w": -1}}')
-    with pytest.raises(FileFormatError, match=r"cam_params.json: camera.w: expected a finite numb"):
+    with pytest.raises(
+        FileFormatError, match=r"cam_params.json: camera.w: expected a number of at least"
+    ):
         read_capture(tmp_path)
 
 

@@ -224,7 +224,7 @@ BOMB = '<!DOCTYPE a [<!ENTITY b "bbbbbbbb"><!ENTITY c "&b;&b;&b;&b;&b;&b;&b;&b;&
         ),
         (
             {"transform": stored_matrix("transform", np.eye(4)).replace("<data>1 ", "<data>a ")},
-            "transform: could not convert",
+            "transform: expected numbers, got other words",
         ),
         (
             {"transform": stored_matrix("transform", np.eye(4)).replace(">4<", ">-4<")},

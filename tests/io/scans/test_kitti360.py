@@ -6,7 +6,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from splatseg.errors import FileFormatError, InputError, MissingFileError
-from splatseg.io.scans import clouds, find_scans, read_scans
+from splatseg.io.scans import _source, find_scans, read_scans
 from support.benchmark_layouts import write_layout
 from support.benchmark_layouts.kitti360 import rolled, write_window
 from support.kitti import (
@@ -76,7 +76,7 @@ def test_a_point_moves_by_its_share_of_the_turn(root) -> None:
 
 def test_turning_is_undone(rng) -> None:
     """A car that also turns: the writer's inverse, found by steps, and the reader's formula."""
-    from splatseg.io.scans import _velodyne
+    from splatseg.io.scans.kitti360 import unrolled
 
     motion = np.eye(4)
     motion[:3, :3] = Rotation.from_rotvec([0.01, -0.02, 0.08]).as_matrix()
@@ -84,7 +84,7 @@ def test_turning_is_undone(rng) -> None:
     points = rng.normal(size=(500, 3)) * 9
     measured, kept = rolled(points, motion)
     assert kept.mean() > 0.98
-    np.testing.assert_allclose(_velodyne.unrolled(measured[kept], motion), points[kept], atol=1e-6)
+    np.testing.assert_allclose(unrolled(measured[kept], motion), points[kept], atol=1e-6)
     assert np.abs(measured - points).max() > 0.3
 
 
@@ -183,7 +183,7 @@ def test_accumulated_points(tmp_path, monkeypatch) -> None:
     assert len(read_scans(static.with_name("dynamic")).scan("0000000002_0000000009")) == 1
     for name in ("static/0000000002_0000000009.ply", "2_9", "3_5"):
         assert read_scans(static.parent / name).scan_names == ("0000000002_0000000009",)
-    monkeypatch.setattr(clouds, "PIECE", 3)
+    monkeypatch.setattr(_source, "PIECE", 3)
     pieces = read_scans(static / "0000000002_0000000009.ply", format="kitti360-points")
     assert pieces.scan_names == ("0000000002_0000000009_0000", "0000000002_0000000009_0001")
     assert pieces.scan(pieces.scan_names[1]).points.tolist() == xyz[3:].tolist()
@@ -236,7 +236,7 @@ def test_scans_without_poses(root) -> None:
     write_poses(root, {70: car_pose(70)})
     with pytest.raises(InputError, match="scans with poses, got 7 scans of which none has a pose"):
         read_scans(root)
-    with pytest.raises(InputError, match="got 2 scans of frames 2 to 3 of which none has a pose"):
+    with pytest.raises(InputError, match="got 2 scans from 2 to 3 of which none has a pose"):
         read_scans(root / "data_3d_raw" / DRIVE / "2_3")
 
 

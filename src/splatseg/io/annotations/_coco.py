@@ -10,32 +10,83 @@ numbers.
 """
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Annotated, Any
 
 import numpy as np
+from msgspec import Meta
+from numpy.typing import NDArray
 
 from splatseg.core import ClassInfo, ClassTable
-from splatseg.core.json_values import json_integer, json_number
-from splatseg.errors import FileFormatError, quoted
+from splatseg.errors import quoted
 from splatseg.io.annotations._base import AnnotatedPicture, Annotations, renumbered
 from splatseg.io.annotations._regions import Canvas, Region, corners_of
+from splatseg.io.evidence._masks import RunLengths
 from splatseg.io.foreign import is_folder, made_from, reading
 from splatseg.io.images import open_image
 from splatseg.io.limits import check_unpacked
 from splatseg.io.paths import path_inside
+from splatseg.io.schema import Name, Side, Whole, expect, malformed, structured
 
 _FOLDERS = ("panoptic", "panoptic_seg", ".")
 """Where the PNGs of panoptic segments lie beside their JSON, if not in a folder of its name."""
 
-_MAX_SIDE = 1 << 24
-_MAX_NAME = 200
-"""Characters of the name of a PNG."""
+_Id = int | str
+_PngName = Annotated[str, Meta(min_length=1, max_length=200)]
 
-Row = dict[str, Any]
+
+@dataclass(frozen=True, slots=True)
+class _Image:
+    id: _Id
+    file_name: str
+    height: Side | None = None
+    width: Side | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class _Category:
+    id: Whole
+    name: Name
+    isthing: Any = 1
+
+
+@dataclass(frozen=True, slots=True)
+class _Segment:
+    """Of panoptic segments; without its id a row of a data set or of results."""
+
+    id: Whole
+    category_id: Whole
+    score: float = 1.0
+    isthing: bool | int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class _Row:
+    """An annotation of a data set, or a result."""
+
+    image_id: _Id | None = None
+    file_name: str | None = None
+    category_id: Whole | None = None
+    segmentation: Any = None
+    """Looked at when its picture is asked for: outlines may be most of a file."""
+
+    segments_info: list[_Segment] | None = None
+    score: float = 1.0
+
+    @property
+    def has_mask(self) -> bool:
+        """Whether it says which pixels are inside."""
+        return isinstance(self.segmentation, (dict, list)) and len(self.segmentation) > 0  # pyright: ignore[reportUnknownArgumentType, reportUnknownMemberType]
+
+
+@dataclass(frozen=True, slots=True)
+class _Dataset:
+    images: list[_Image] = field(default_factory=list[_Image])
+    annotations: list[_Row] = field(default_factory=list[_Row])
+    categories: list[_Category] = field(default_factory=list[_Category])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,108 +102,112 @@ class _Categories:
         """Whether a class has instances, where the file tells."""
         return {} if self.classes is None else {row.id: row.isthing for row in self.classes.rows}
 
-    def id_of(self, row: Row, *, where: str) -> int:
-        own = row.get("category_id")
-        number = json_integer(own, where=f"{where}: category_id")
-        if number not in self.ids:
-            raise FileFormatError(f"{where}: there is no category {quoted(own)}.")
-        return self.ids[number]
+    def id_of(self, own: int | None, *, where: str) -> int:
+        if own not in self.ids:
+            raise malformed(where, "one of the file's categories as category_id", own)
+        return self.ids[own]
 
 
-def coco_dataset(path: Path, content: Row) -> Annotations:
+def is_dataset(content: object) -> bool:
+    """Whether a JSON value is COCO's own file of a data set."""
+    return isinstance(content, dict) and "images" in content and "annotations" in content
+
+
+def is_results(rows: object) -> bool:
+    """Whether a JSON value is a list of a detector's results."""
+    first: object = rows[0] if isinstance(rows, list) and rows else None
+    return (
+        isinstance(first, dict)
+        and "category_id" in first
+        and ("image_id" in first or "file_name" in first)
+    )
+
+
+def coco_dataset(path: Path, content: object) -> Annotations:
     """Instances or panoptic segments of a file with ``images`` and ``annotations``.
 
     Raises:
         FileFormatError: If it lacks something, or holds no masks at all.
     """
-    annotations = _rows(content, "annotations", path)
-    panoptic = any("segments_info" in row for row in annotations)
-    segments = annotations
+    dataset = structured(content, _Dataset, where=path)
+    rows = dataset.annotations
+    panoptic = any(row.segments_info is not None for row in rows)
+    used: list[int | None] = [row.category_id for row in rows]
     if panoptic:
-        segments = [s for row in annotations for s in _rows(row, "segments_info", path)]
-    categories = _categories(content, segments, path)
-    by_image: dict[object, list[Row]] = {}
-    for i, row in enumerate(annotations):
-        key = _image_id(row.get("image_id"), where=f"{path}: annotations[{i}]")
-        by_image.setdefault(key, []).append(row)
+        used = [segment.category_id for row in rows for segment in row.segments_info or ()]
+    categories = _categories(dataset, used, path)
+    by_image: dict[_Id | None, list[_Row]] = {}
+    for row in rows:
+        by_image.setdefault(row.image_id, []).append(row)
     left_out = Counter[str]()
     pictures: list[AnnotatedPicture] = []
     folder = _png_folder(path) if panoptic else path.parent
-    for i, row in enumerate(_rows(content, "images", path)):
-        where = f"{path}: images[{i}]"
-        name = row.get("file_name")
-        if not isinstance(name, str):
-            raise FileFormatError(f"{where}: expected a file_name, got {quoted(name)}.")
-        mine = by_image.pop(_image_id(row.get("id"), where=where), [])
+    for image in dataset.images:
+        mine = by_image.pop(image.id, [])
         if panoptic:
             regions = partial(_panoptic_regions, mine, categories, folder)
         else:
-            whole = [one for one in mine if _has_mask(one)]
-            left_out["boxes"] += len(mine) - len(whole)
-            regions = partial(_instance_regions, whole, categories)
-        size = _size(row, where=where)
-        pictures.append(AnnotatedPicture(name=name, path=path, size=size, regions=regions))
+            masked = [row for row in mine if row.has_mask]
+            left_out["boxes"] += len(mine) - len(masked)
+            regions = partial(_instance_regions, masked, categories)
+        sides = (image.height, image.width)
+        size = None if None in sides else (int(sides[0] or 0), int(sides[1] or 0))
+        pictures.append(
+            AnnotatedPicture(name=image.file_name, path=path, size=size, regions=regions)
+        )
     if by_image:
-        raise FileFormatError(
-            f"{path}: expected annotations of its images, got some of image_id "
-            f"{quoted(next(iter(by_image)))}, which it does not list."
-        )
-    if left_out["boxes"] and left_out["boxes"] == len(annotations):
-        raise FileFormatError(
-            f"{path}: expected masks, got {len(annotations)} boxes without any; export with "
-            "segmentation (polygons or run lengths)."
-        )
+        got = f"some of image_id {quoted(next(iter(by_image)))}, which it does not list"
+        raise malformed(path, f"annotations of its images, got {got}")
+    boxes = left_out["boxes"]
+    hint = "export with segmentation (polygons or run lengths)"
+    expect(not boxes or boxes < len(rows), path, f"masks, got {boxes} boxes without any; {hint}")
+    return _annotations(path, pictures, categories, "panoptic" if panoptic else "masks", boxes)
+
+
+def _annotations(
+    path: Path, pictures: Sequence[AnnotatedPicture], found: _Categories, kind: Any, boxes: int
+) -> Annotations:
     return Annotations(
-        path=path, pictures=pictures, classes=categories.classes, source_ids=categories.source_ids,
-        kind="panoptic" if panoptic else "masks", left_out=+left_out,
+        path=path, pictures=pictures, classes=found.classes, source_ids=found.source_ids,
+        kind=kind, left_out={"boxes": boxes} if boxes else {},
     )  # fmt: skip
 
 
-def coco_results(path: Path, results: Sequence[Row], dataset: Row | None) -> Annotations:
+def coco_results(path: Path, results: object, dataset: object) -> Annotations:
     """Results of a detector, or of a segmenter of classes where they have a ``file_name``.
 
     Args:
         path: The file of results.
         results: Its rows.
-        dataset: Content of the data set's own file, which names the pictures and the classes.
+        dataset: Content of the data set's own file, which names the pictures and the classes, or
+            None.
 
     Raises:
         FileFormatError: If rows lack something, or are boxes alone.
     """
-    images: dict[object, str] = {}
-    for i, row in enumerate(_rows(dataset or {"images": []}, "images", path)):
-        images[_image_id(row.get("id"), where=f"{path}: images[{i}]")] = str(row.get("file_name"))
-    masked = [row for row in results if _has_mask(row)]
-    if not masked:
-        raise FileFormatError(
-            f"{path}: expected results with a segmentation, got {len(results)} boxes without any; "
-            "run a model that gives masks."
-        )
-    categories = _categories(dataset or {}, masked, path)
-    semantic = "file_name" in masked[0]
-    by_name: dict[str, list[Row]] = {}
+    rows = structured(results, list[_Row], where=path)
+    known = structured(dataset or {}, _Dataset, where=path)
+    names = {image.id: image.file_name for image in known.images}
+    masked = [row for row in rows if row.has_mask]
+    hint = "run a model that gives masks"
+    expect(masked, path, f"results with a segmentation, got {len(rows)} boxes without any; {hint}")
+    categories = _categories(known, [row.category_id for row in masked], path)
+    semantic = masked[0].file_name is not None
+    by_name: dict[str, list[_Row]] = {}
     for i, row in enumerate(masked):
-        where = f"{path}: results[{i}]"
-        if semantic:
-            name = row.get("file_name")
-            if not isinstance(name, str):
-                raise FileFormatError(f"{where}: expected a file_name, got {quoted(name)}.")
-        else:
-            id = _image_id(row.get("image_id"), where=where)
-            name = images.get(id, str(id))
-        by_name.setdefault(name, []).append(row)
+        id = row.file_name if semantic else row.image_id
+        if id is None:
+            raise malformed(f"{path}: results[{i}]", "a file_name or image_id", id)
+        by_name.setdefault(str(id) if semantic else names.get(id, str(id)), []).append(row)
     pictures = [
         AnnotatedPicture(
-            name=name, path=path, size=_mask_size(rows[0], path),
-            regions=partial(_instance_regions, rows, categories),
+            name=name, path=path, size=_mask_size(mine[0], path),
+            regions=partial(_instance_regions, mine, categories),
         )
-        for name, rows in by_name.items()
+        for name, mine in by_name.items()
     ]  # fmt: skip
-    boxes = {"boxes": len(results) - len(masked)} if len(results) > len(masked) else {}
-    return Annotations(
-        path=path, pictures=pictures, classes=categories.classes, source_ids=categories.source_ids,
-        kind="labels" if semantic else "masks", left_out=boxes,
-    )  # fmt: skip
+    kind = "labels" if semantic else "masks"
+    return _annotations(path, pictures, categories, kind, len(rows) - len(masked))
 
 
 def named_by(annotations: Annotations, table: ClassTable) -> Annotations:
@@ -166,65 +221,58 @@ def named_by(annotations: Annotations, table: ClassTable) -> Annotations:
 
 
 def _instance_regions(
-    rows: Sequence[Row], categories: _Categories, canvas: Canvas
+    rows: Sequence[_Row], categories: _Categories, canvas: Canvas
 ) -> Iterator[Region]:
+    where = canvas.where
     for row in rows:
-        segmentation, where = row["segmentation"], canvas.where
-        if isinstance(segmentation, dict):
-            mask = canvas.coco_runs(segmentation)
+        place = f"{where}: segmentation"
+        found = structured(row.segmentation, RunLengths | list[list[float]], where=place)  # pyright: ignore[reportArgumentType]
+        if isinstance(found, RunLengths):
+            mask = found.mask(canvas.height, canvas.width, where=where)
         else:
-            outlines = (corners_of(one, where=where, pairs=False) for one in segmentation)
-            mask = canvas.outlined(outlines)
-        score = min(1.0, max(0.0, json_number(row.get("score", 1), where=f"{where}: score")))
-        category = categories.id_of(row, where=where)
-        yield Region(
-            mask=mask, category=category, score=score, order=score,
-            isthing=categories.things.get(category, True),
-        )  # fmt: skip
+            mask = canvas.outlined(corners_of(one, where=where) for one in found)
+        score = min(1.0, max(0.0, row.score))
+        category = categories.id_of(row.category_id, where=where)
+        isthing = categories.things.get(category, True)
+        yield Region(mask=mask, category=category, score=score, order=score, isthing=isthing)
 
 
 def _panoptic_regions(
-    rows: Sequence[Row], categories: _Categories, folder: Path, canvas: Canvas
+    rows: Sequence[_Row], categories: _Categories, folder: Path, canvas: Canvas
 ) -> Iterator[Region]:
     """A region each segment of a picture's PNG that `segments_info` tells of."""
+    where = canvas.where
     for row in rows:
-        name, where = row.get("file_name"), canvas.where
-        if not isinstance(name, str) or not 0 < len(name) <= _MAX_NAME:
-            raise FileFormatError(f"{where}: expected the file_name of a PNG, got {quoted(name)}.")
+        name = structured(row.file_name, _PngName, where=f"{where}: file_name")  # pyright: ignore[reportArgumentType]
         with made_from(where):
-            png = path_inside(folder, name, make=False)
+            png = path_inside(folder, str(name), make=False)
         codes = _png_codes(png, canvas)
         order = np.argsort(codes, axis=None, kind="stable")
         present, firsts = np.unique(codes.ravel()[order], return_index=True)
         pixels = dict(zip(present.tolist(), np.split(order, firsts[1:]), strict=True))
-        for segment in _rows(row, "segments_info", where):
-            id = json_integer(segment.get("id"), where=f"{where}: id of a segment")
-            if id not in pixels or id == 0:
+        for segment in row.segments_info or ():
+            if segment.id not in pixels or segment.id == 0:
                 continue
-            at = np.divmod(pixels[id], canvas.width)
+            at = np.divmod(pixels[segment.id], canvas.width)
             top, left = int(at[0].min()), int(at[1].min())
             inside = np.zeros((int(at[0].max()) - top + 1, int(at[1].max()) - left + 1), bool)
             inside[at[0] - top, at[1] - left] = True
-            category = categories.id_of(segment, where=where)
-            score = json_number(segment.get("score", 1), where=f"{where}: score")
-            yield Region(
-                mask=canvas.boxed(inside, left, top), category=category,
-                score=min(1.0, max(0.0, score)),
-                isthing=bool(segment.get("isthing", categories.things.get(category, True))),
-            )  # fmt: skip
+            category = categories.id_of(segment.category_id, where=where)
+            known = categories.things.get(category, True)
+            isthing = known if segment.isthing is None else bool(segment.isthing)
+            score = min(1.0, max(0.0, segment.score))
+            mask = canvas.boxed(inside, left, top)
+            yield Region(mask=mask, category=category, score=score, isthing=isthing)
 
 
-def _png_codes(path: Path, canvas: Canvas) -> np.ndarray:
+def _png_codes(path: Path, canvas: Canvas) -> NDArray[np.int32]:
+    width, height = canvas.width, canvas.height
     with open_image(path) as image:
-        if image.size != (canvas.width, canvas.height) or image.mode not in ("RGB", "RGBA"):
-            raise FileFormatError(
-                f"{path}: expected {canvas.width}x{canvas.height} pixels in colours, got "
-                f"{image.size[0]}x{image.size[1]} in mode {image.mode}."
-            )
-        check_unpacked(
-            path, canvas.width * canvas.height * 24, packed=path.stat().st_size,
-            what=f"segments of {canvas.width}x{canvas.height} pixels",
-        )  # fmt: skip
+        fits = image.size == (width, height) and image.mode in ("RGB", "RGBA")
+        got = f"{image.size[0]}x{image.size[1]} in mode {image.mode}"
+        expect(fits, path, f"{width}x{height} pixels in colours, got {got}")
+        what = f"segments of {width}x{height} pixels"
+        check_unpacked(path, width * height * 24, packed=path.stat().st_size, what=what)
         with reading(path, "a PNG of segment ids"):
             pixels = np.asarray(image.convert("RGB"))
     return pixels.astype(np.int32) @ np.array([1, 1 << 8, 1 << 16], np.int32)
@@ -235,81 +283,26 @@ def _png_folder(path: Path) -> Path:
         folder = path.parent / name
         if is_folder(folder) and any(folder.rglob("*.png")):
             return folder
-    raise FileFormatError(
-        f"{path}: expected the PNGs of its segments in the folder {quoted(path.stem)} beside it, "
-        "got none."
-    )
+    what = f"the PNGs of its segments in the folder {quoted(path.stem)} beside it, got none"
+    raise malformed(path, what)
 
 
-def _categories(content: Row, rows: Iterable[Row], path: Path) -> _Categories:
+def _categories(dataset: _Dataset, used: Sequence[int | None], path: Path) -> _Categories:
     """The classes of a file, or the ids that its rows use where it names none."""
-    listed = _rows(content, "categories", path) if "categories" in content else []
-    infos: dict[int, tuple[str, bool]] = {}
-    for i, row in enumerate(listed):
-        where = f"{path}: categories[{i}]"
-        id, name = json_integer(row.get("id"), where=f"{where}: id"), row.get("name")
-        if not isinstance(name, str) or not name:
-            raise FileFormatError(f"{where}: expected a name, got {quoted(name)}.")
-        infos[id] = name, bool(row.get("isthing", 1))
-    used = () if listed else [row.get("category_id") for row in rows]
-    own = [json_integer(id, where=f"{path}: category_id") for id in used]
-    ids, back = renumbered([*infos, *own])
+    listed = dataset.categories
+    infos = {row.id: row for row in listed}
+    ids, back = renumbered(infos if listed else (id for id in used if id is not None))
     with made_from(path):
-        table = ClassTable(
-            rows=tuple(
-                ClassInfo(id=ids[id], name=name, isthing=isthing)
-                for id, (name, isthing) in sorted(infos.items())
-            )
+        rows = (
+            ClassInfo(id=ids[id], name=row.name, isthing=bool(row.isthing))
+            for id, row in sorted(infos.items())
         )
+        table = ClassTable(rows=tuple(rows))
     return _Categories(ids=ids, classes=table if listed else None, source_ids=back)
 
 
-def _rows(content: Mapping[str, Any], key: str, where: object) -> list[Row]:
-    rows = content.get(key)
-    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in cast(Row, rows)):
-        raise FileFormatError(f"{where}: expected a list of objects as {key}, got {quoted(rows)}.")
-    return cast(list[Row], rows)
-
-
-def _image_id(value: object, *, where: str) -> int | str:
-    if isinstance(value, bool) or not isinstance(value, (int, str)):
-        raise FileFormatError(f"{where}: expected the id of an image, got {quoted(value)}.")
-    return value
-
-
-def _size(row: Row, *, where: str) -> tuple[int, int] | None:
-    if row.get("height") is None or row.get("width") is None:
-        return None
-    height, width = (
-        json_integer(row[key], where=f"{where}: {key}", low=1, high=_MAX_SIDE)
-        for key in ("height", "width")
-    )
-    return height, width
-
-
-def _mask_size(row: Row, path: Path) -> tuple[int, int] | None:
+def _mask_size(row: _Row, path: Path) -> tuple[int, int] | None:
     """Height and width that the run lengths of a result have."""
-    segmentation = row["segmentation"]
-    size = segmentation.get("size") if isinstance(segmentation, dict) else None
-    if not isinstance(size, list) or len(cast(list[object], size)) != 2:
+    if not isinstance(row.segmentation, dict):
         return None
-    return _size({"height": size[0], "width": size[1]}, where=f"{path}: size of a segmentation")
-
-
-def _has_mask(row: Row) -> bool:
-    """Whether an annotation says which pixels are inside."""
-    segmentation = row.get("segmentation")
-    return isinstance(segmentation, (dict, list)) and bool(cast(object, segmentation))
-
-
-def is_results(rows: object) -> bool:
-    """Whether a JSON value is a list of a detector's results."""
-    first = cast(list[object], rows)[0] if isinstance(rows, list) and rows else None
-    if not isinstance(first, dict):
-        return False
-    return "category_id" in first and ("image_id" in first or "file_name" in first)
-
-
-def is_dataset(content: object) -> bool:
-    """Whether a JSON value is COCO's own file of a data set."""
-    return isinstance(content, dict) and "images" in content and "annotations" in content
+    return structured(row.segmentation, RunLengths, where=f"{path}: segmentation").size

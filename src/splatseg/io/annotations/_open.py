@@ -1,13 +1,14 @@
 """Tells which tool wrote a file or folder of annotations, and opens it; or says what to export."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple
 
 from splatseg.core import View
 from splatseg.core.boundary import boundary
 from splatseg.errors import FileFormatError, InputError, MissingFileError, quoted
-from splatseg.io.annotations._base import Annotations, evidence_of
+from splatseg.io.annotations._base import Annotations, evidence_of, pictures_of_views
 from splatseg.io.annotations._coco import (
     coco_dataset,
     coco_results,
@@ -15,18 +16,24 @@ from splatseg.io.annotations._coco import (
     is_results,
     named_by,
 )
-from splatseg.io.annotations._colours import class_pictures, picture_tables
-from splatseg.io.annotations._cvat import cvat_annotations
-from splatseg.io.annotations._label_studio import (
+from splatseg.io.annotations._drawn import (
+    cvat_annotations,
     is_label_studio,
     is_label_studio_min,
+    is_labelme,
     label_studio_annotations,
+    labelme_annotations,
 )
-from splatseg.io.annotations._labelme import is_labelme, labelme_annotations
-from splatseg.io.evidence import Evidence
+from splatseg.io.evidence import Evidence, LabelEvidence, view_files
 from splatseg.io.evidence._base import HEADER_FILE
+from splatseg.io.evidence._labels import IdRule, Palette
 from splatseg.io.json_files import read_json_value
 from splatseg.io.label_tables import label_table
+from splatseg.io.schema import expect
+
+_CLASSES = "SegmentationClass"
+_CAMVID = "annot"
+_TABLE_FILES = ("labelmap.txt", "label_colors.txt")
 
 _OPENED = frozenset({".json", ".npy", ".npz", ".png", ".tif", ".tiff", ".xml"})
 """Suffixes of files that hold evidence of some kind."""
@@ -78,7 +85,7 @@ def open_annotations(
         if (path / HEADER_FILE).is_file():
             return None
         if picture_tables(path):
-            return class_pictures(path, views, classes=classes)
+            return _class_pictures(path, views, classes=classes)
     annotations = _of_folder(path) if path.is_dir() else _of_file(path)
     if annotations is None:
         return None
@@ -137,49 +144,69 @@ def _of_folder(folder: Path) -> Annotations | None:
     results = [path for path, content in contents.items() if is_results(content)]
     if results:
         return _results(_only(results), contents)
-    known = {path: read for path, content in contents.items() if (read := _reader(content))}
+    known = [p for p, content in contents.items() if any(tool.tells(content) for tool in _TOOLS)]
     if not known:
         return None
     path = _only(sorted(known))
-    return known[path](path)
+    return _of_json(path, contents[path])
+
+
+class _Tool(NamedTuple):
+    """How the JSON of a tool is told, and read or refused."""
+
+    tells: Callable[[object], bool]
+    read: Callable[[Path, Any], Annotations]
+
+
+def _refuse(words: str, path: Path, _: Any) -> Annotations:
+    raise FileFormatError(f"{path}: expected {words}.")
+
+
+def _is_datumaro(content: object) -> bool:
+    return isinstance(content, dict) and "items" in content and "categories" in content
+
+
+_TOOLS = (
+    _Tool(
+        is_label_studio_min,
+        partial(
+            _refuse,
+            "Label Studio's JSON, got JSON-MIN, which lacks the tasks; export JSON or COCO",
+        ),
+    ),
+    _Tool(is_label_studio, label_studio_annotations),
+    _Tool(is_dataset, coco_dataset),
+    _Tool(is_labelme, lambda path, _: labelme_annotations(path, [path])),
+    _Tool(
+        _is_datumaro,
+        partial(
+            _refuse,
+            "annotations, got datumaro's own format; export COCO, CVAT or Pascal VOC segmentation "
+            "(datum convert -f coco_instances)",
+        ),
+    ),
+)
+"""In the order in which they are looked for."""
 
 
 def _of_json(path: Path, content: Any) -> Annotations | None:
     if is_results(content):
         beside = {p: read_json_value(p) for p in sorted(path.parent.glob("*.json")) if p != path}
         return _results(path, beside | {path: content})
-    reader = _reader(content)
-    return None if reader is None else reader(path)
-
-
-def _reader(content: Any) -> Callable[[Path], Annotations] | None:
-    if is_label_studio_min(content):
-        return _refuse_min
-    if is_label_studio(content):
-        return lambda path: label_studio_annotations(path, cast(list[object], content))
-    if is_dataset(content):
-        return lambda path: coco_dataset(path, content)
-    if is_labelme(content):
-        return lambda path: labelme_annotations(path, [path])
-    if isinstance(content, dict) and "items" in content and "categories" in content:
-        return _refuse_datumaro
-    return None
+    tool = next((tool for tool in _TOOLS if tool.tells(content)), None)
+    return None if tool is None else tool.read(path, content)
 
 
 def _results(path: Path, contents: dict[Path, Any]) -> Annotations:
     datasets = [p for p, content in contents.items() if is_dataset(content)]
     dataset = contents[_only(sorted(datasets))] if datasets else None
-    rows = contents[path]
-    wrong = [row for row in rows if not isinstance(row, dict)]
-    if wrong:
-        raise FileFormatError(f"{path}: expected a list of results, got {quoted(wrong[0])} in it.")
-    return coco_results(path, rows, dataset)
+    return coco_results(path, contents[path], dataset)
 
 
 def _is_of_one_view(content: Any) -> bool:
     """Whether a JSON value is the masks of one picture, as SAM and we write them."""
     if isinstance(content, list):
-        first = cast(list[Any], content)[0] if content else {}
+        first: object = content[0] if content else {}
         return isinstance(first, dict) and not is_results(content) and "segmentation" in first
     return isinstance(content, dict) and ("masks" in content or "image" in content)
 
@@ -205,15 +232,36 @@ def _advise(folder: Path) -> None:
             )
 
 
-def _refuse_min(path: Path) -> Annotations:
-    raise FileFormatError(
-        f"{path}: expected Label Studio's JSON, got JSON-MIN, which lacks the tasks; export JSON "
-        "or COCO."
+def picture_tables(folder: Path) -> tuple[Path, ...]:
+    """The table of colours of a folder of pictures of classes, or beside it where it is one.
+
+    labelmap.txt, SegmentationClass/NAME.png       CVAT's segmentation mask 1.1, Pascal VOC
+    label_colors.txt, SPLITannot/NAME.png          CamVid
+    """
+    places = (folder, folder.parent) if _holds_pictures(folder) else (folder,)
+    return tuple(p / name for p in places for name in _TABLE_FILES if (p / name).is_file())[:1]
+
+
+def _class_pictures(folder: Path, views: Sequence[View], *, classes: str | None) -> LabelEvidence:
+    """Label maps of the pictures of a folder, by the colours of its table."""
+    (path,) = picture_tables(folder)
+    if classes is not None:
+        raise InputError(f"classes: {path} names the classes of its pictures itself.")
+    table = label_table(str(path))
+    below = sorted(p for p in (folder, *folder.iterdir()) if p.is_dir() and _holds_pictures(p))
+    found = [item for one in below for item in view_files(one, ".png").items()]
+    expect(found, path, f"{_CLASSES} beside it with PNGs, got none")
+    names = [f"{name}.png" for name, _ in found]
+    indices, notes = pictures_of_views(names, views, where=str(folder))
+    return LabelEvidence(
+        folder=folder,
+        files={view: found[i][1] for view, i in indices.items()},
+        table=table.classes,
+        rule=IdRule(zero_is_class=table.zero_is_class),
+        palette=Palette(table.classes),
+        remarks=notes,
     )
 
 
-def _refuse_datumaro(path: Path) -> Annotations:
-    raise FileFormatError(
-        f"{path}: expected annotations, got datumaro's own format; export COCO, CVAT or Pascal VOC "
-        "segmentation (datum convert -f coco_instances)."
-    )
+def _holds_pictures(folder: Path) -> bool:
+    return folder.name == _CLASSES or folder.name.endswith(_CAMVID)

@@ -6,23 +6,21 @@ to an outline that holds its centre (even-odd).
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeGuard, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from splatseg.core import Rle
-from splatseg.core.json_values import is_json_number
-from splatseg.errors import FileFormatError, InputError, quoted
+from splatseg.core.json_values import MAX_NUMBER
+from splatseg.errors import quoted
 from splatseg.io.limits import check_unpacked
+from splatseg.io.schema import expect, malformed
 
 _BYTES_OF_CROSSING = 48
 """What an edge takes in a row of pixels that it crosses: its number, the row, and where."""
 
 _BYTES_OF_PIXEL = 12
 """Of the box of an outline: how often its edges were crossed, and whether that is odd."""
-
-MAX_RUN = int(np.iinfo(np.uint32).max)
 
 Bool2 = NDArray[np.bool_]
 
@@ -78,9 +76,8 @@ class Canvas:
             bottom = max(y + part.shape[0] for part, (_, y) in parts)
             canvas, box = np.zeros((bottom - top, right - left), bool), (left, top)
             for part, (x, y) in parts:
-                canvas[y - top : y - top + part.shape[0], x - left : x - left + part.shape[1]] |= (
-                    part
-                )
+                height, width = part.shape
+                canvas[y - top : y - top + height, x - left : x - left + width] |= part
         return self.boxed(canvas, *box)
 
     def boxed(self, inside: Bool2, left: int, top: int) -> Rle:
@@ -95,11 +92,10 @@ class Canvas:
             FileFormatError: If the box does not lie in the picture.
         """
         rows, columns = inside.shape
-        if min(left, top) < 0 or left + columns > self.width or top + rows > self.height:
-            raise FileFormatError(
-                f"{self.where}: expected masks within {self.width}x{self.height} pixels, got one "
-                f"of {columns}x{rows} at ({quoted(left)}, {quoted(top)})."
-            )
+        inside_it = min(left, top) >= 0
+        inside_it = inside_it and left + columns <= self.width and top + rows <= self.height
+        got = f"one of {columns}x{rows} at ({quoted(left)}, {quoted(top)})"
+        expect(inside_it, self.where, f"masks within {self.width}x{self.height} pixels, got {got}")
         padded = np.zeros((columns, rows + 2), np.int8)
         padded[:, 1:-1] = inside.T
         steps = np.diff(padded, axis=1)
@@ -109,37 +105,11 @@ class Canvas:
         )
         # A run that ends at the bottom row goes on where the next one begins at the top.
         joined = firsts[1:] == lasts[:-1]
-        edges = np.stack(
-            (
-                firsts[np.append(True, ~joined)[: len(firsts)]],
-                lasts[np.append(~joined, True)[: len(lasts)]],
-            ),
-            1,
-        )
+        begins = firsts[np.append(True, ~joined)[: len(firsts)]]
+        edges = np.stack((begins, lasts[np.append(~joined, True)[: len(lasts)]]), 1)
         counts = np.diff(np.concatenate(([0], edges.ravel(), [self.height * self.width])))
         counts = counts[:-1] if len(counts) > 1 and counts[-1] == 0 else counts
         return Rle(height=self.height, width=self.width, counts=counts.astype(np.uint32))
-
-    def coco_runs(self, segmentation: object) -> Rle:
-        """A COCO mask: ``size`` and ``counts``, which are text (compressed) or numbers.
-
-        Raises:
-            FileFormatError: If it is of another size, or its runs do not add up to it.
-        """
-        fields = cast(dict[str, Any], segmentation) if isinstance(segmentation, dict) else {}
-        size, counts = fields.get("size"), fields.get("counts")
-        if size != [self.height, self.width] or not isinstance(counts, (str, list)):
-            raise FileFormatError(
-                f"{self.where}: expected run lengths of {self.width}x{self.height} pixels, with "
-                f"the size [{self.height}, {self.width}], got {quoted(size)}."
-            )
-        try:
-            if isinstance(counts, str):
-                return Rle.from_coco(counts, height=self.height, width=self.width)
-            runs = whole_runs(cast(list[object], counts))
-            return Rle(height=self.height, width=self.width, counts=runs.astype(np.uint32))
-        except InputError as error:
-            raise FileFormatError(f"{self.where}: {error}") from error
 
     def _filled(self, corners: NDArray[np.float64]) -> tuple[Bool2, tuple[int, int]] | None:
         """The inside of one outline in its box, and the box's first column and row."""
@@ -175,37 +145,20 @@ class Canvas:
         check_unpacked(self.where, pixels * _BYTES_OF_PIXEL, packed=self.packed, what=what)
 
 
-def corners_of(values: object, *, where: str, pairs: bool) -> NDArray[np.float64]:
-    """Corners (n, 2) of an outline of a JSON document: x, y, x, y, ... or [x, y], [x, y], ...
+def corners_of(numbers: Sequence[float] | None, *, where: str) -> NDArray[np.float64]:
+    """Corners (n, 2) of an outline: x, y, x, y, ...; None is no numbers.
 
     Raises:
-        FileFormatError: If one is no finite number, or there are fewer than three corners.
+        FileFormatError: If there are fewer than three corners, or one is not finite.
     """
-    listed = cast(list[object], values) if isinstance(values, list) else []
-    if pairs:
-        rows = [cast(list[object], row) if isinstance(row, list) else [row] for row in listed]
-        # What is no pair is shown as it is, which is no number.
-        listed = [number for row in rows for number in (row if len(row) == 2 else [row])]
-    wrong = [number for number in listed if not is_json_number(number)]
-    if wrong or len(listed) < 6 or len(listed) % 2:
-        got = quoted(wrong[0]) if wrong else f"{len(listed)} numbers"
-        raise FileFormatError(
-            f"{where}: expected an outline of at least three corners, two finite numbers each, got "
-            f"{got}."
-        )
-    return np.array(listed, np.float64).reshape(-1, 2)
-
-
-def whole_runs(runs: Sequence[object]) -> NDArray[np.int64]:
-    """Run lengths out of a file.
-
-    Raises:
-        InputError: If one is no whole number that 32 bits hold.
-    """
-    wrong = [run for run in runs if not _is_run(run)]
-    if wrong:
-        raise InputError(f"counts: expected whole numbers up to {MAX_RUN}, got {quoted(wrong[0])}.")
-    return np.array(runs, np.int64)
+    what = "an outline of at least three corners, two finite numbers each, got "
+    if numbers is None:
+        raise malformed(where, f"{what}other words")
+    few = len(numbers) < 6 or len(numbers) % 2
+    expect(not few, where, f"{what}{len(numbers)} numbers")
+    corners = np.array(numbers, np.float64).reshape(-1, 2)
+    expect((np.abs(corners) <= MAX_NUMBER).all(), where, f"{what}others")
+    return corners
 
 
 def merged(regions: Iterable[Region]) -> list[Region]:
@@ -224,7 +177,3 @@ def merged(regions: Iterable[Region]) -> list[Region]:
             order=max(first.order, region.order), isthing=first.isthing, group=first.group,
         )  # fmt: skip
     return sorted(found, key=lambda region: region.order)
-
-
-def _is_run(value: object) -> TypeGuard[int]:
-    return type(value) is int and 0 <= value <= MAX_RUN

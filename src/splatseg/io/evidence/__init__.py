@@ -16,14 +16,13 @@ from splatseg.io.evidence._base import RENDERS_FOLDER as RENDERS_FOLDER
 from splatseg.io.evidence._base import Evidence as Evidence
 from splatseg.io.evidence._base import EvidenceKind as EvidenceKind
 from splatseg.io.evidence._base import view_files as view_files
-from splatseg.io.evidence._depth import DepthEvidence as DepthEvidence
 from splatseg.io.evidence._features import TEXT_FILE as TEXT_FILE
+from splatseg.io.evidence._features import DepthEvidence as DepthEvidence
 from splatseg.io.evidence._features import FeatureEvidence as FeatureEvidence
 from splatseg.io.evidence._features import TextEmbeddings as TextEmbeddings
 from splatseg.io.evidence._features import load_text_embeddings as load_text_embeddings
-from splatseg.io.evidence._label_files import read_id_map as read_id_map
 from splatseg.io.evidence._labels import LabelEvidence as LabelEvidence
-from splatseg.io.evidence._masked import without_masked as without_masked
+from splatseg.io.evidence._labels import read_id_map as read_id_map
 from splatseg.io.evidence._masks import MaskEvidence as MaskEvidence
 from splatseg.io.evidence._open import evidence_header as evidence_header
 from splatseg.io.evidence._open import evidence_names as evidence_names
@@ -32,7 +31,8 @@ from splatseg.io.evidence._open import open_evidence as open_evidence
 from splatseg.io.evidence._segments import SEGMENTS_FILE as SEGMENTS_FILE
 from splatseg.io.evidence._segments import PanopticEvidence as PanopticEvidence
 from splatseg.io.evidence._segments import TrackedEvidence as TrackedEvidence
-from splatseg.io.evidence._sizes import check_map_sizes as check_map_sizes
+from splatseg.io.evidence._segments import check_map_sizes as check_map_sizes
+from splatseg.io.evidence._segments import without_masked as without_masked
 from splatseg.io.evidence._write import create_evidence as create_evidence
 from splatseg.io.evidence._write import save_depth_map as save_depth_map
 from splatseg.io.evidence._write import save_features as save_features

@@ -5,24 +5,27 @@ The JSON and the folder are what SAM's automatic mask generator writes.
 
 import csv
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, TypeGuard, cast
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
+from msgspec import Meta
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from splatseg.core import FeatureMap, MaskSet, Rle
-from splatseg.core.json_values import json_integer, json_number
-from splatseg.errors import FileFormatError, InputError, quoted, reason
-from splatseg.io.evidence._base import EvidenceKind, IdFreeEvidence, refuse
-from splatseg.io.evidence._label_files import read_id_map
+from splatseg.core import MaskSet, Rle
+from splatseg.errors import reason
+from splatseg.io.evidence._base import EvidenceKind, FileEvidence
+from splatseg.io.evidence._labels import read_id_map
+from splatseg.io.foreign import made_from
 from splatseg.io.json_files import read_json_value
 from splatseg.io.limits import check_unpacked
 from splatseg.io.npy import read_npy
 from splatseg.io.npz import npz_names, read_npz
+from splatseg.io.schema import Side, check_array, expect, malformed, structured
 
 MASK_TABLE = "metadata.csv"
 """What SAM's tool writes beside the pictures of masks of one photograph."""
@@ -30,35 +33,69 @@ MASK_TABLE = "metadata.csv"
 _STACKS = ("masks", "segmentation", "segmentations")
 """Arrays of an npz that are stacks of masks."""
 
-_SCORES = ("score", "predicted_iou")
 _INT32 = np.iinfo(np.int32)
-_MAX_SIDE = 1 << 24
-_MAX_RUN = int(np.iinfo(np.uint32).max)
+
+
+@dataclass(frozen=True, slots=True)
+class RunLengths:
+    """A COCO mask: text (compressed) or numbers."""
+
+    size: tuple[Side, Side]
+    """Height and width."""
+
+    counts: str | list[Annotated[int, Meta(ge=0, le=2**32 - 1)]]
+
+    def mask(self, height: int, width: int, *, where: str) -> Rle:
+        """The mask in a picture of this size.
+
+        Raises:
+            FileFormatError: If it is of another, or its runs do not add up to it.
+        """
+        what = f"run lengths of {width}x{height} pixels, with the size [{height}, {width}]"
+        expect(self.size == (height, width), where, what, list(self.size))
+        with made_from(where):
+            if isinstance(self.counts, str):
+                return Rle.from_coco(self.counts, height=height, width=width)
+            return Rle(height=height, width=width, counts=np.array(self.counts, np.uint32))
+
+
+@dataclass(frozen=True, slots=True)
+class _Row:
+    segmentation: RunLengths
+    score: float | None = None
+    predicted_iou: float | None = None
+    level: Annotated[int, Meta(ge=-(2**31), le=2**31 - 1)] = 0
+
+
+@dataclass(frozen=True, slots=True)
+class _Picture:
+    height: Side
+    width: Side
+
+
+@dataclass(frozen=True, slots=True)
+class _Own(_Picture):
+    masks: list[_Row]
+
+
+@dataclass(frozen=True, slots=True)
+class _Sa1b:
+    image: _Picture
+    annotations: list[_Row]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class MaskEvidence(IdFreeEvidence):
+class MaskEvidence(FileEvidence):
     """Overlapping masks without classes."""
 
-    @property
-    @override
-    def kind(self) -> EvidenceKind:
-        return "masks"
+    kind: EvidenceKind = "masks"
 
     @override
     def masks(self, name: str) -> MaskSet:
-        return read_any_masks(self.file_of(name))
-
-    @override
-    def features(self, name: str) -> FeatureMap:
-        refuse(self, "features")
-
-
-def read_any_masks(path: Path) -> MaskSet:
-    """The masks of one view: a JSON, an npz or a folder of pictures."""
-    if path.is_dir():
-        return read_mask_images(path)
-    return read_mask_arrays(path) if path.suffix in (".npz", ".npy") else read_masks(path)
+        path = self.file_of(name)
+        if path.is_dir():
+            return _read_images(path)
+        return _read_arrays(path) if path.suffix in (".npz", ".npy") else _read_json(path)
 
 
 def holds_masks(path: Path) -> bool:
@@ -69,14 +106,18 @@ def holds_masks(path: Path) -> bool:
     return path.suffix == ".npz" and _stack_name(path) is not None
 
 
-def read_mask_arrays(path: Path) -> MaskSet:
+def _stack_name(path: Path) -> str | None:
+    """The array of an npz that is a stack of masks; one without a name is where it is alone."""
+    names = npz_names(path)
+    if tuple(names) == ("arr_0",):
+        return "arr_0"
+    return next((name for name in _STACKS if name in names), None)
+
+
+def _read_arrays(path: Path) -> MaskSet:
     """The masks (m, height, width) of an ``.npy``, or of an npz: ``masks`` or another usual name.
 
     Of an npz ``scores``, or SAM's ``predicted_iou``, and ``levels`` may lack.
-
-    Raises:
-        MissingFileError: If there is no such file.
-        FileFormatError: If it holds anything else.
     """
     if path.suffix == ".npy":
         arrays = {"masks": read_npy(path)}
@@ -84,31 +125,14 @@ def read_mask_arrays(path: Path) -> MaskSet:
         name = _stack_name(path) or "masks"
         arrays = read_npz(path, [name], optional=["scores", "predicted_iou", "levels"])
         arrays["masks"] = arrays[name]
-        if "predicted_iou" in arrays:
-            arrays.setdefault("scores", arrays["predicted_iou"])
-    masks = arrays["masks"]
-    if (
-        masks.ndim != 3
-        or 0 in masks.shape[1:]
-        or masks.dtype.kind not in "bui"
-        or (masks.size and masks.min() < 0)
-    ):
-        raise FileFormatError(
-            f"{path}: expected masks of shape (masks, height, width) in booleans or 0 and 1, "
-            f"got {masks.dtype} of {masks.shape}."
-        )
-    count = len(masks)
-    scores, levels = arrays.get("scores", np.ones(count)), arrays.get("levels", np.zeros(count))
-    if scores.shape != (count,) or scores.dtype.kind not in "biuf" or not _is_finite(scores):
-        raise FileFormatError(
-            f"{path}: expected a finite score for each of {count} masks, "
-            f"got {scores.dtype} of {scores.shape}."
-        )
-    if levels.shape != (count,) or not _are_levels(levels):
-        raise FileFormatError(
-            f"{path}: expected a whole number as level for each of {count} masks, from "
-            f"{_INT32.min} to {_INT32.max}, got {levels.dtype} of {levels.shape}."
-        )
+    masks = check_array(path, "masks", arrays["masks"], ("masks", "height", "width"), "bui")
+    sound = 0 not in masks.shape[1:] and not (masks.size and masks.min() < 0)
+    expect(sound, path, f"masks in booleans or 0 and 1, got {masks.dtype} of {masks.shape}")
+    scores = _of_masks(path, "scores", arrays.get("scores", arrays.get("predicted_iou")), masks, 1)
+    levels = _of_masks(path, "levels", arrays.get("levels"), masks, 0)
+    whole = (levels == np.trunc(levels)) & (levels >= _INT32.min) & (levels <= _INT32.max)
+    what = f"a whole number as level for each of {len(masks)} masks, from {_INT32.min} to "
+    expect(whole.all(), path, f"{what}{_INT32.max}, got others")
     return MaskSet(
         height=int(masks.shape[1]),
         width=int(masks.shape[2]),
@@ -118,54 +142,46 @@ def read_mask_arrays(path: Path) -> MaskSet:
     )
 
 
-def _stack_name(path: Path) -> str | None:
-    """The array of an npz that is a stack of masks; one without a name is where it is alone."""
-    names = npz_names(path)
-    if tuple(names) == ("arr_0",):
-        return "arr_0"
-    return next((name for name in _STACKS if name in names), None)
+def _of_masks(
+    path: Path, name: str, values: NDArray[Any] | None, masks: NDArray[Any], default: int
+) -> NDArray[Any]:
+    """A finite number of each mask."""
+    if values is None:
+        return np.full(len(masks), default)
+    values = check_array(path, name, values, (len(masks),), "biuf")
+    expect(np.isfinite(values).all(), path, f"finite {name}, got NaN or infinity")
+    return values
 
 
-def _is_finite(values: NDArray[Any]) -> bool:
-    return bool(np.isfinite(values).all())
-
-
-def _are_levels(levels: NDArray[Any]) -> bool:
-    """Whether values are whole numbers that int32 holds, in whatever type they came."""
-    if levels.dtype.kind not in "biuf" or not _is_finite(levels):
-        return False
-    within = (levels >= _INT32.min) & (levels <= _INT32.max)
-    return bool(within.all() and (levels == np.trunc(levels)).all())
-
-
-def read_mask_images(folder: Path) -> MaskSet:
+def _read_images(folder: Path) -> MaskSet:
     """The masks of a folder of pictures, zero outside a mask, in the order of their numbers.
 
     Scores are ``predicted_iou`` of the metadata.csv that SAM's tool writes beside them, else 1.
-
-    Raises:
-        FileFormatError: If they differ in size, have colours, or metadata.csv does not fit.
     """
     files = sorted(folder.glob("*.png"), key=lambda p: (len(p.stem), p.stem))
-    if not files:
-        raise FileFormatError(f"{folder}: expected PNG pictures of masks, got none.")
+    expect(files, folder, "PNG pictures of masks, got none")
     scores = _image_scores(folder / MASK_TABLE)
     masks: list[Rle] = []
     for path in files:  # one at a time: all together may take far more than their files
         array = read_id_map(path)
-        first = masks[0] if masks else None
-        if first is not None and array.shape != (first.height, first.width):
-            raise FileFormatError(
-                f"{path}: expected {first.width}x{first.height} pixels as "
-                f"{files[0].name} has, got {array.shape[1]}x{array.shape[0]}."
-            )
+        height, width = (masks[0].height, masks[0].width) if masks else array.shape
+        what = f"{width}x{height} pixels as {files[0].name} has"
+        fits = array.shape == (height, width)
+        expect(fits, path, f"{what}, got {array.shape[1]}x{array.shape[0]}")
         masks.append(Rle.encode(torch.from_numpy(array != 0)))
+    found = [scores.get(path.stem, 1.0) for path in files]
+    return _mask_set(masks, found, [0] * len(files), (masks[0].height, masks[0].width))
+
+
+def _mask_set(
+    masks: Sequence[Rle], scores: Sequence[float], levels: Sequence[int], size: tuple[int, int]
+) -> MaskSet:
     return MaskSet(
-        height=masks[0].height,
-        width=masks[0].width,
+        height=size[0],
+        width=size[1],
         masks=tuple(masks),
-        scores=torch.tensor([scores.get(path.stem, 1.0) for path in files]).clamp(0, 1),
-        levels=torch.zeros(len(files), dtype=torch.int32),
+        scores=torch.tensor(scores, dtype=torch.float32).clamp(0, 1),
+        levels=torch.tensor(levels, dtype=torch.int32),
     )
 
 
@@ -179,138 +195,74 @@ def mask_folders(folder: Path, *, marked_by: Literal["metadata.csv", "*.png"]) -
     }
 
 
-def _image_scores(path: Path) -> dict[str, float]:
+def _image_scores(path: Path) -> Mapping[str, float]:
     if not path.is_file():
         return {}
     try:
         with path.open(encoding="utf-8", newline="") as file:
-            rows = list(csv.DictReader(file))
-        scores = {row["id"]: float(row["predicted_iou"]) for row in rows}
+            scores = {row["id"]: float(row["predicted_iou"]) for row in csv.DictReader(file)}
     except (KeyError, TypeError, ValueError, csv.Error, OSError) as error:
-        raise FileFormatError(
-            f"{path}: expected the columns id and predicted_iou, as SAM's tool writes "
-            f"({reason(error)})."
-        ) from error
-    if not all(math.isfinite(score) for score in scores.values()):
-        raise FileFormatError(f"{path}: expected finite scores, got others.")
+        what = "the columns id and predicted_iou, as SAM's tool writes"
+        raise malformed(path, f"{what} ({reason(error)})") from error
+    expect(all(map(math.isfinite, scores.values())), path, "finite scores, got others")
     return scores
 
 
-def read_masks(path: Path) -> MaskSet:
-    """The masks of one file.
-
-    Scores are ``score``, else ``predicted_iou``, else 1, clamped to [0, 1]; levels are
-    ``level``, else 0. Run lengths may be compressed text or a list of numbers.
-
-    Raises:
-        MissingFileError: If there is no such file.
-        FileFormatError: If it holds anything else.
-    """
-    rows, height, width = _mask_rows(read_json_value(path))
-    if not isinstance(rows, list) or not _is_side(height) or not _is_side(width):
-        raise FileFormatError(
-            f"{path}: expected masks with their height and width, in run lengths as SAM's "
-            f"generator gives them with output_mode='coco_rle', got {quoted(height)} and "
-            f"{quoted(width)}."
-        )
-    check_unpacked(
-        path,
-        height * width,
-        packed=path.stat().st_size,
-        what=f"masks of {width}x{height} pixels",
-    )
-    masks: list[Rle] = []
-    scores: list[float] = []
-    levels: list[int] = []
-    for i, row in enumerate(cast(list[object], rows)):
-        where = f"{path}: masks[{i}]"
-        fields = cast(dict[str, Any], row) if isinstance(row, dict) else {}
-        masks.append(_rle(fields.get("segmentation"), height, width, where=where))
-        score = next((fields[key] for key in _SCORES if key in fields), 1.0)
-        level = fields.get("level", 0)
-        number = json_number(score, where=f"{where}: score")
-        scores.append(min(1.0, max(0.0, number)))
-        levels.append(
-            json_integer(level, where=f"{where}: level", low=int(_INT32.min), high=int(_INT32.max))
-        )
-    return MaskSet(
-        height=height,
-        width=width,
-        masks=tuple(masks),
-        scores=torch.tensor(scores, dtype=torch.float32),
-        levels=torch.tensor(levels, dtype=torch.int32),
-    )
-
-
 def holds_mask_rows(content: object) -> bool:
-    """Whether a JSON value is the masks of one picture."""
-    return isinstance(_mask_rows(content)[0], list)
-
-
-def _mask_rows(content: object) -> tuple[object, object, object]:
-    """The rows of masks, and the height and width of their picture, None where it has none.
+    """Whether a JSON value is the masks of one picture.
 
     Ours are an object with ``masks``, ``height`` and ``width``; a file of SA-1B has ``annotations``
     and ``image``; what SAM's generator gives is a list of rows, and their first tells the size.
     """
     if isinstance(content, list):
-        rows = cast(list[object], content)
-        first = cast(dict[str, Any], rows[0]) if rows and isinstance(rows[0], dict) else {}
-        segmentation = first.get("segmentation")
-        size = cast(dict[str, Any], segmentation if isinstance(segmentation, dict) else {}).get(
-            "size"
-        )
-        sides = cast(list[object], size) if isinstance(size, list) else []
-        height, width = sides if len(sides) == 2 else (None, None)
-        return (rows if "segmentation" in first else None), height, width
-    fields = cast(dict[str, Any], content) if isinstance(content, dict) else {}
-    if "masks" not in fields and isinstance(fields.get("image"), dict):
-        image = cast(dict[str, Any], fields["image"])
-        return fields.get("annotations"), image.get("height"), image.get("width")
-    return fields.get("masks"), fields.get("height"), fields.get("width")
+        first: object = content[0] if content else None
+        return isinstance(first, dict) and "segmentation" in first
+    if not isinstance(content, dict):
+        return False
+    of_sa1b = isinstance(content.get("image"), dict) and "annotations" in content
+    return isinstance(content.get("masks"), list) or of_sa1b
+
+
+def _read_json(path: Path) -> MaskSet:
+    """The masks of one file.
+
+    Scores are ``score``, else ``predicted_iou``, else 1, clamped to [0, 1]; levels are
+    ``level``, else 0. Run lengths may be compressed text or a list of numbers.
+    """
+    content: Any = read_json_value(path)
+    if isinstance(content, list):
+        first = content[0] if content and isinstance(content[0], dict) else {}
+        hint = "masks in run lengths, as SAM's generator gives them with output_mode='coco_rle'"
+        expect(isinstance(first.get("segmentation"), dict), path, f"{hint}, got others")
+        rows = structured(content, list[_Row], where=path)
+        height, width = rows[0].segmentation.size
+    elif isinstance(content, dict) and "masks" not in content and "image" in content:
+        found = structured(content, _Sa1b, where=path)
+        rows, height, width = found.annotations, found.image.height, found.image.width
+    else:
+        own = structured(content, _Own, where=path)
+        rows, height, width = own.masks, own.height, own.width
+    what = f"masks of {width}x{height} pixels"
+    check_unpacked(path, height * width, packed=path.stat().st_size, what=what)
+    masks = [
+        row.segmentation.mask(height, width, where=f"{path}: masks[{i}]")
+        for i, row in enumerate(rows)
+    ]
+    scores = [next((s for s in (r.score, r.predicted_iou) if s is not None), 1.0) for r in rows]
+    return _mask_set(masks, scores, [row.level for row in rows], (height, width))
 
 
 def masks_content(masks: MaskSet) -> dict[str, Any]:
-    """The JSON object of a set of masks. Inverse of `read_masks`."""
+    """The JSON object of a set of masks, which is read back as the same."""
+    scored = zip(masks.masks, masks.scores.tolist(), masks.levels.tolist(), strict=True)
     rows = [
         {
-            "segmentation": {
-                "size": [masks.height, masks.width],
-                "counts": mask.to_coco(),
-            },
+            "segmentation": {"size": [masks.height, masks.width], "counts": mask.to_coco()},
             "area": mask.area,
             "bbox": list(mask.bbox),
             "score": score,
             "level": level,
         }
-        for mask, score, level in zip(
-            masks.masks, masks.scores.tolist(), masks.levels.tolist(), strict=True
-        )
+        for mask, score, level in scored
     ]
     return {"height": masks.height, "width": masks.width, "masks": rows}
-
-
-def _rle(segmentation: object, height: int, width: int, *, where: str) -> Rle:
-    fields = cast(dict[str, Any], segmentation) if isinstance(segmentation, dict) else {}
-    counts = fields.get("counts")
-    if fields.get("size") != [height, width] or not isinstance(counts, (str, list)):
-        raise FileFormatError(
-            f"{where}: expected a run-length mask of {height} x {width}, "
-            f"got size {quoted(fields.get('size'))}."
-        )
-    try:
-        if isinstance(counts, str):
-            return Rle.from_coco(counts, height=height, width=width)
-        runs = cast(list[object], counts)
-        wrong = [run for run in runs if type(run) is not int or not 0 <= run <= _MAX_RUN]
-        if wrong:
-            raise InputError(
-                f"counts: expected whole numbers from 0 to {_MAX_RUN}, got {quoted(wrong[0])}."
-            )
-        return Rle(height=height, width=width, counts=np.array(runs, np.uint32))
-    except (InputError, OverflowError) as error:
-        raise FileFormatError(f"{where}: {error}") from error
-
-
-def _is_side(value: object) -> TypeGuard[int]:
-    return isinstance(value, int) and not isinstance(value, bool) and 0 < value <= _MAX_SIDE

@@ -9,40 +9,31 @@ from typing import Any, Literal, cast
 from splatseg.core import ClassTable
 from splatseg.core.boundary import boundary
 from splatseg.core.json_values import id_of_key
-from splatseg.errors import FileFormatError, InputError, MissingFileError, RangeError, quoted
+from splatseg.errors import InputError, MissingFileError, RangeError
 from splatseg.io.captures import read_metadata
 from splatseg.io.class_tables import class_table
+from splatseg.io.depths import DEPTH_NAME
 from splatseg.io.evidence._base import (
     HEADER_FILE,
+    MAX_FILE_ID,
     Evidence,
     EvidenceKind,
     picture_files,
     view_files,
 )
-from splatseg.io.evidence._depth import holds_depth, open_depth
 from splatseg.io.evidence._features import (
     BASIS_FILE,
     QUANTISATION_FILE,
-    holds_features,
+    DepthEvidence,
     open_features,
 )
-from splatseg.io.evidence._label_files import LABEL_NAMES, Palette, is_soft
-from splatseg.io.evidence._labels import IdRule, LabelEvidence, check_rule
-from splatseg.io.evidence._masks import (
-    MaskEvidence,
-    holds_mask_rows,
-    holds_masks,
-    mask_folders,
-)
-from splatseg.io.evidence._segments import (
-    SEGMENTS_FILE,
-    TRACKS_FILE,
-    open_panoptic,
-    open_tracked,
-)
+from splatseg.io.evidence._labels import LABEL_NAMES, IdRule, LabelEvidence, Palette, is_soft
+from splatseg.io.evidence._masks import MaskEvidence, holds_mask_rows, holds_masks, mask_folders
+from splatseg.io.evidence._segments import SEGMENTS_FILE, TRACKS_FILE, open_tables
 from splatseg.io.json_files import read_json, read_json_value
 from splatseg.io.label_tables import LabelTable, label_table, training_table
 from splatseg.io.npz import npz_names
+from splatseg.io.schema import expect, structured
 
 FORMAT = "splatseg-evidence"
 VERSION = 2
@@ -108,7 +99,11 @@ def open_evidence(
     if not folder.is_dir():
         raise MissingFileError(f"{folder}: there is no such folder of evidence.")
     header = _header(folder)
-    rule = check_rule(zero_is_class, void)
+    if void is not None and not 0 <= void <= MAX_FILE_ID:
+        raise InputError(f"void: expected an id in [0, {MAX_FILE_ID}], got {void}.")
+    if zero_is_class and void == 0:
+        raise InputError("void: expected another id than 0, which zero_is_class makes a class.")
+    rule = IdRule(zero_is_class=zero_is_class, void=void)
     maps, arrays = picture_files(folder, suffix), view_files(folder, suffix + ".npz")
     objects = view_files(folder, suffix + ".json")
     if not maps and (kind is None or kind == "labels"):
@@ -122,12 +117,13 @@ def open_evidence(
         raise InputError(f"depth_unit: goes with depth maps, {folder} has none.")
     if found == "depth":
         others = maps or view_files(folder, suffix + ".npy")
-        return open_depth(folder, arrays, others, unit=_metres(depth_unit))
+        _check_unit(folder, arrays, depth_unit)
+        return DepthEvidence(folder=folder, files=arrays or others, unit=depth_unit)
     if found in ("labels", "panoptic", "tracked"):
         soft = bool(maps) and is_soft(next(iter(maps.values())))
         table = _named_table(classes, soft=soft)
         labels = LabelEvidence(
-            root=folder,
+            folder=folder,
             files=maps,
             table=_classes(folder, header) if table is None else table.classes,
             rule=_rule(rule, table, soft=soft),
@@ -135,15 +131,14 @@ def open_evidence(
             channels=None if table is None else len(table.classes.rows),
             recorded=_recorded_ids(folder, header),
         )
-        if found == "labels":
-            return labels
-        return open_panoptic(labels) if found == "panoptic" else open_tracked(labels)
+        tracked = found == "tracked"
+        return labels if found == "labels" else open_tables(labels, tracked=tracked)
     if classes is not None:
         raise InputError(f"classes: goes with label maps, {folder} has none.")
     if found == "masks":
         stacks = objects or arrays or view_files(folder, suffix + ".npy")
         files = stacks or mask_folders(folder, marked_by="*.png")
-        return MaskEvidence(root=folder, files=files)
+        return MaskEvidence(folder=folder, files=files)
     if found == "features":
         return open_features(folder, arrays)
     raise InputError(
@@ -152,10 +147,13 @@ def open_evidence(
     )
 
 
-def _metres(unit: float | None) -> float | None:
+def _check_unit(folder: Path, arrays: Mapping[str, Path], unit: float | None) -> None:
     if unit is not None and not (math.isfinite(unit) and unit > 0):
         raise RangeError(f"depth_unit: expected a number of metres above 0, got {unit:g}.")
-    return unit
+    if unit is not None and arrays:
+        raise InputError(
+            f"depth_unit: goes with images and .npy files, got {folder}, whose npz files tell it."
+        )
 
 
 def _label_arrays(folder: Path, suffix: str, arrays: Mapping[str, Path]) -> Mapping[str, Path]:
@@ -254,14 +252,10 @@ def _header(folder: Path) -> dict[str, Any]:
     if not path.is_file():
         return {}
     header = read_json(path)
-    version = header.get("version")
-    if header.get("format") != FORMAT or not isinstance(version, int):
-        raise FileFormatError(f"{path}: expected evidence, got {quoted(header.get('format'))}.")
-    if not 1 <= version <= VERSION:
-        raise FileFormatError(
-            f"{path}: expected evidence of version {VERSION} or less, "
-            f"got version {quoted(version)}; a later splatseg wrote it."
-        )
+    expect(header.get("format") == FORMAT, path, "evidence", header.get("format"))
+    version = structured(header.get("version"), int, where=f"{path}: version")
+    what = f"evidence of version {VERSION} or less, got version {version}"
+    expect(1 <= version <= VERSION, path, f"{what}; a later splatseg wrote it")
     return header
 
 
@@ -293,13 +287,13 @@ def _kind(
         return "masks"
     if (folder / QUANTISATION_FILE).is_file() or (folder / BASIS_FILE).is_file():
         return "features" if arrays else None
-    if arrays and holds_features(next(iter(arrays.values()))):
+    if not arrays:
+        return None
+    first = next(iter(arrays.values()))
+    names = npz_names(first)
+    if "features" in names:
         return "features"
-    if arrays and holds_masks(next(iter(arrays.values()))):
-        return "masks"
-    if arrays and holds_depth(next(iter(arrays.values()))):
-        return "depth"
-    return None
+    return "masks" if holds_masks(first) else "depth" if DEPTH_NAME in names else None
 
 
 def _classes(folder: Path, header: dict[str, Any]) -> ClassTable | None:
@@ -315,11 +309,9 @@ def _recorded_ids(folder: Path, header: dict[str, Any]) -> dict[int, int] | None
     recorded = header.get("source_ids")
     if recorded is None:
         return None
-    entries = cast(dict[str, object], recorded) if isinstance(recorded, dict) else {"": None}
-    ids = {id_of_key(key): id for key, id in entries.items()}
-    if None in ids or not all(isinstance(id, int) for id in ids.values()):
-        raise FileFormatError(
-            f"{folder / HEADER_FILE}: expected source_ids of integers by integer, "
-            f"got {quoted(recorded)}."
-        )
-    return {cast(int, key): cast(int, id) for key, id in ids.items()}
+    where = f"{folder / HEADER_FILE}: source_ids"
+    ids = {
+        id_of_key(key): id for key, id in structured(recorded, dict[str, int], where=where).items()
+    }
+    expect(None not in ids, where, "integers by integer", recorded)
+    return {key: id for key, id in ids.items() if key is not None}

@@ -1,34 +1,56 @@
 """Panoptic and tracked evidence: label maps whose ids have a table beside them."""
 
 from abc import ABC
-from collections.abc import Mapping
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, cast
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Any, TypeVar
 
 import torch
+from msgspec import Meta
 from typing_extensions import override
 
 from splatseg.core import (
     UNLABELLED,
     ClassInfo,
     ClassTable,
-    FeatureMap,
     LabelMap,
     MaskSet,
     Segment,
     Track,
+    View,
     map_ids,
 )
-from splatseg.core.json_values import json_integer, json_number
-from splatseg.errors import FileFormatError, quoted
-from splatseg.io.evidence._base import MAX_FILE_ID, Evidence, EvidenceKind, is_id, refuse
-from splatseg.io.evidence._labels import LabelEvidence, masks_of_ids
+from splatseg.core.json_values import id_of_key
+from splatseg.io.evidence._base import MAX_FILE_ID, Evidence, EvidenceKind
+from splatseg.io.evidence._labels import LabelEvidence, check_size, masks_of_ids
 from splatseg.io.json_files import read_json
+from splatseg.io.schema import Whole, malformed, structured
 
 SEGMENTS_FILE = "segments.json"
 TRACKS_FILE = "tracks.json"
-_DIGITS = 5
+AnyEvidence = TypeVar("AnyEvidence", bound=Evidence)
+
+
+@dataclass(frozen=True, slots=True)
+class _SegmentRow:
+    id: Annotated[int, Meta(ge=0, le=MAX_FILE_ID)]
+    category_id: Annotated[int, Meta(ge=-1, le=MAX_FILE_ID)]
+    isthing: Any = True
+    score: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class _SegmentRows:
+    """What segments.json has by view."""
+
+    segments_info: list[_SegmentRow]
+
+
+@dataclass(frozen=True, slots=True)
+class _TrackRow:
+    """What tracks.json has by track."""
+
+    category_votes: dict[str, Whole] = field(default_factory=dict[str, int])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -41,32 +63,15 @@ class TableEvidence(Evidence, ABC):
 
     @property
     @override
-    def folder(self) -> Path:
-        return self.maps.folder
-
-    @property
-    @override
     def view_names(self) -> tuple[str, ...]:
         return self.maps.view_names
-
-    @property
-    @override
-    def source_ids(self) -> Mapping[int, int] | None:
-        return None
-
-    @override
-    def features(self, name: str) -> FeatureMap:
-        refuse(self, "features")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PanopticEvidence(TableEvidence):
     """Segments of each view; an id means something in its own view only."""
 
-    @property
-    @override
-    def kind(self) -> EvidenceKind:
-        return "panoptic"
+    kind: EvidenceKind = "panoptic"
 
     @property
     @override
@@ -82,9 +87,8 @@ class PanopticEvidence(TableEvidence):
 
     def category_map(self, name: str) -> LabelMap:
         """Category ids of a view, which mean the same in all views; scores as confidence."""
-        segments = self.segments(name)
         maps = self.label_map(name)
-        categories = {segment.id: segment.category for segment in segments}
+        categories = {segment.id: segment.category for segment in self.segments(name)}
         ids = map_ids(maps.ids, categories, default=UNLABELLED, dtype=torch.int32)
         return LabelMap(ids=ids, confidence=maps.confidence)
 
@@ -98,49 +102,32 @@ class PanopticEvidence(TableEvidence):
         Raises:
             FileFormatError: If segments.json does not tell them.
         """
-        path = self.folder / SEGMENTS_FILE
-        entry = self.table.get(name)
-        rows = cast(dict[str, Any], entry).get("segments_info") if isinstance(entry, dict) else None
-        if not isinstance(rows, list):
-            raise FileFormatError(f"{path}: expected segments_info of view {name!r}, got none.")
-        segments: list[Segment] = []
-        for row in cast(list[object], rows):
-            fields = cast(dict[str, Any], row) if isinstance(row, dict) else {}
-            id, category = fields.get("id"), fields.get("category_id")
-            score = fields.get("score", 1.0)
-            if not is_id(id) or not (category == -1 or is_id(category)):
-                raise FileFormatError(
-                    f"{path}: view {name!r}: expected segments with id and category_id up to "
-                    f"{MAX_FILE_ID}, got {quoted(row)}."
-                )
-            number = json_number(score, where=f"{path}: view {quoted(name)}: score of segment {id}")
-            segments.append(
-                Segment(
-                    id=id,
-                    category=category if category > 0 else UNLABELLED,
-                    isthing=bool(fields.get("isthing", True)),
-                    score=min(1.0, max(0.0, number)),
-                )
+        path, where = self.folder / SEGMENTS_FILE, f"view {name!r}"
+        if name not in self.table:
+            raise malformed(path, f"segments_info of {where}, got none")
+        rows = structured(self.table[name], _SegmentRows, where=f"{path}: {where}").segments_info
+        return tuple(
+            Segment(
+                id=row.id,
+                category=row.category_id if row.category_id > 0 else UNLABELLED,
+                isthing=bool(row.isthing),
+                score=min(1.0, max(0.0, row.score)),
             )
-        return tuple(sorted(segments, key=lambda segment: segment.id))
+            for row in sorted(rows, key=lambda row: row.id)
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TrackedEvidence(TableEvidence):
     """Objects followed through the views; an id means the same object in all of them."""
 
-    @property
-    @override
-    def kind(self) -> EvidenceKind:
-        return "tracked"
+    kind: EvidenceKind = "tracked"
 
     @property
     def order(self) -> tuple[str, ...]:
         """Views in the order in which they were tracked."""
         order = self.table.get("order")
-        if not isinstance(order, list):
-            return self.view_names
-        return tuple(str(name) for name in cast(list[object], order))
+        return tuple(map(str, order)) if isinstance(order, list) else self.view_names  # pyright: ignore[reportUnknownArgumentType, reportUnknownVariableType]
 
     @property
     def tracks(self) -> tuple[Track, ...]:
@@ -149,26 +136,15 @@ class TrackedEvidence(TableEvidence):
         Raises:
             FileFormatError: If tracks.json does not tell them.
         """
-        rows = self.table.get("tracks")
         path = self.folder / TRACKS_FILE
-        if not isinstance(rows, dict):
-            raise FileFormatError(f"{path}: expected an object of tracks, got none.")
+        where = f"{path}: tracks"
+        rows = structured(self.table.get("tracks"), dict[str, _TrackRow], where=where)
         found: list[Track] = []
-        for key, row in cast(dict[str, object], rows).items():
-            fields = cast(dict[str, Any], row) if isinstance(row, dict) else {}
-            votes = fields.get("category_votes", {})
-            if not _is_key(key) or not isinstance(votes, dict):
-                raise FileFormatError(
-                    f"{path}: expected tracks by id up to {MAX_FILE_ID}, got "
-                    f"{quoted(key)}: {quoted(row)}."
-                )
-            counts = cast(dict[str, object], votes)
-            where = f"{path}: category_votes of track {key}"
-            found.append(
-                Track(
-                    id=int(key), votes={n: json_integer(v, where=where) for n, v in counts.items()}
-                )
-            )
+        for key, row in rows.items():
+            id = id_of_key(key)
+            if id is None or id > MAX_FILE_ID:
+                raise malformed(path, f"tracks by id up to {MAX_FILE_ID}", key)
+            found.append(Track(id=id, votes=row.category_votes))
         return tuple(sorted(found, key=lambda track: track.id))
 
     @property
@@ -176,17 +152,16 @@ class TrackedEvidence(TableEvidence):
     def classes(self) -> ClassTable:
         """One row a track, named after its class and id, such as ``desk 3``."""
         things = {row.name: row.isthing for row in self.maps.table.rows} if self.maps.table else {}
-        return ClassTable(
-            rows=tuple(
-                ClassInfo(
-                    id=track.id,
-                    name=f"{track.category or 'track'} {track.id}",
-                    isthing=things.get(track.category or "", True),
-                )
-                for track in self.tracks
-                if track.id > 0
+        rows = (
+            ClassInfo(
+                id=track.id,
+                name=f"{track.category or 'track'} {track.id}",
+                isthing=things.get(track.category or "", True),
             )
+            for track in self.tracks
+            if track.id > 0
         )
+        return ClassTable(rows=tuple(rows))
 
     @override
     def label_map(self, name: str) -> LabelMap:
@@ -197,16 +172,42 @@ class TrackedEvidence(TableEvidence):
         return self.maps.masks(name)
 
 
-def open_panoptic(maps: LabelEvidence) -> PanopticEvidence:
-    """Panoptic evidence of a folder of label maps with segments.json."""
-    return PanopticEvidence(maps=maps, table=read_json(maps.folder / SEGMENTS_FILE))
+def open_tables(maps: LabelEvidence, *, tracked: bool) -> TableEvidence:
+    """Evidence of a folder of label maps with segments.json or tracks.json."""
+    cls, file = (TrackedEvidence, TRACKS_FILE) if tracked else (PanopticEvidence, SEGMENTS_FILE)
+    return cls(folder=maps.folder, maps=maps, table=read_json(maps.folder / file))
 
 
-def open_tracked(maps: LabelEvidence) -> TrackedEvidence:
-    """Tracked evidence of a folder of label maps with tracks.json."""
-    return TrackedEvidence(maps=maps, table=read_json(maps.folder / TRACKS_FILE))
+def without_masked(evidence: AnyEvidence, views: Iterable[View]) -> AnyEvidence:
+    """Label maps without the pixels that masks of views leave out, such as those of moving things.
+
+    Evidence of other kinds (masks, features, depth) is given back as it is.
+
+    Args:
+        evidence: Labels, panoptic or tracked.
+        views: Views with their masks; maps of others are as they were.
+    """
+    masked = {view.name: view for view in views if view.mask is not None}
+    if masked and isinstance(evidence, LabelEvidence):
+        return replace(evidence, masked=masked)
+    if masked and isinstance(evidence, TableEvidence):
+        return replace(evidence, maps=replace(evidence.maps, masked=masked))
+    return evidence
 
 
-def _is_key(key: str) -> bool:
-    # Digits of other alphabets are decimal too, but no JSON of ours has them.
-    return key.isascii() and key.isdecimal() and len(key) <= _DIGITS and is_id(int(key))
+def check_map_sizes(evidence: Evidence, views: Iterable[View]) -> None:
+    """Refuse label maps that are far larger than their photographs, before they cost memory.
+
+    Evidence of other kinds passes: masks and features are held against `io.limits` alone.
+
+    Args:
+        evidence: Of any kind.
+        views: The views whose maps will be read; those without a map are passed over.
+
+    Raises:
+        FileFormatError: If a map has more than four times the pixels of its photograph.
+    """
+    maps = evidence.maps if isinstance(evidence, TableEvidence) else evidence
+    for view in views if isinstance(maps, LabelEvidence) else ():
+        if view.name in maps.files:
+            check_size(maps.files[view.name], view)

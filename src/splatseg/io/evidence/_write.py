@@ -31,14 +31,14 @@ from splatseg.io.depths import DEPTH_NAME
 from splatseg.io.evidence._base import (
     CONFIDENCE_FOLDER,
     HEADER_FILE,
+    MAX_FILE_ID,
     RENDERS_FOLDER,
     EvidenceKind,
 )
-from splatseg.io.evidence._features import TEXT_FILE, TextEmbeddings
+from splatseg.io.evidence._features import TEXT_FILE, TextEmbeddings, features_content
 from splatseg.io.evidence._labels import CONFIDENCE_STEPS
 from splatseg.io.evidence._masks import masks_content
 from splatseg.io.evidence._open import FORMAT, written_version
-from splatseg.io.evidence._own_features import features_content
 from splatseg.io.evidence._segments import SEGMENTS_FILE, TRACKS_FILE
 from splatseg.io.images import save_png, write_png
 from splatseg.io.json_files import json_text, write_json
@@ -46,7 +46,6 @@ from splatseg.io.paths import path_inside
 from splatseg.io.write_errors import named_write_failures
 
 _WRITTEN = ("labels", "panoptic", "tracked", "masks", "features", "depth")
-_MAX_ID = 65535
 
 
 @boundary
@@ -109,8 +108,8 @@ def save_label_map(label_map: LabelMap, folder: Path | str, name: str) -> None:
     if (ids == 0).any():
         raise InputError(f"{name}: expected ids from 1 on (0 is void in files), got 0.")
     highest = int(ids.max())
-    if highest > _MAX_ID:
-        raise RangeError(f"{name}: expected ids up to {_MAX_ID}, got {highest}.")
+    if highest > MAX_FILE_ID:
+        raise RangeError(f"{name}: expected ids up to {MAX_FILE_ID}, got {highest}.")
     values = np.where(ids == UNLABELLED, 0, ids)
     confidence: NDArray[np.uint16] | None = None
     if label_map.confidence is not None:
@@ -198,10 +197,8 @@ def save_features(features: FeatureMap | DeepFeatures, folder: Path | str, name:
         RangeError: If a value is NaN or infinite, or beyond the range of float16 (65504).
         InputError: If maps are of images of several sizes, or two depths have one name.
     """
-    content = cast(dict[str, Any], features_content(name, features))
-    path = _view_path(Path(folder), name, ".npz")
-    with atomic_file(path) as temporary, temporary.open("wb") as file:
-        np.savez(file, **content)
+    content = features_content(name, features)
+    _save_arrays(_view_path(Path(folder), name, ".npz"), content)
 
 
 @boundary
@@ -216,9 +213,7 @@ def save_depth_map(depth: DepthMap, folder: Path | str, name: str) -> None:
     arrays: dict[str, NDArray[Any]] = {DEPTH_NAME: half.numpy(), "kind": np.array(depth.kind)}
     if depth.confidence is not None:
         arrays["confidence"] = depth.confidence.detach().cpu().to(torch.float16).numpy()
-    path = _view_path(Path(folder), name, ".npz")
-    with atomic_file(path) as temporary, temporary.open("wb") as file:
-        np.savez(file, **cast(dict[str, Any], arrays))
+    _save_arrays(_view_path(Path(folder), name, ".npz"), arrays)
 
 
 @boundary
@@ -245,19 +240,21 @@ def save_text_embeddings(embeddings: TextEmbeddings, folder: Path | str) -> None
             )
     if len(set(embeddings.labels)) != count:
         raise InputError("labels: expected distinct words, got one more than once.")
-    path = path_inside(Path(folder), TEXT_FILE)
+    arrays: dict[str, NDArray[Any]] = {
+        "labels": np.array(embeddings.labels, np.str_),
+        "vectors": embeddings.vectors.detach().cpu().numpy().astype(np.float32),
+        "kind": np.array(embeddings.kinds, np.str_),
+        "target_id": np.array(embeddings.target_ids, np.int64),
+    }
+    _save_arrays(path_inside(Path(folder), TEXT_FILE), arrays)
+
+
+def _save_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
     with atomic_file(path) as temporary, temporary.open("wb") as file:
-        np.savez(
-            file,
-            labels=np.array(embeddings.labels, np.str_),
-            vectors=embeddings.vectors.detach().cpu().numpy().astype(np.float32),
-            kind=np.array(embeddings.kinds, np.str_),
-            target_id=np.array(embeddings.target_ids, np.int64),
-        )
+        np.savez(file, **cast("dict[str, Any]", arrays))
 
 
-def _view_path(folder: Path, name: str, suffix: str, *, make: bool = True) -> Path:
+def _view_path(folder: Path, name: str, suffix: str) -> Path:
     check_view_name(name)
-    path = folder / f"{name}{suffix}"
-    with named_write_failures(path):
-        return path_inside(folder, f"{name}{suffix}", make=make)
+    with named_write_failures(folder / f"{name}{suffix}"):
+        return path_inside(folder, f"{name}{suffix}")

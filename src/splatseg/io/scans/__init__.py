@@ -1,13 +1,14 @@
 """Scans of lasers in the layouts people have, in the world, read one at a time.
 
-One module a layout; `read_scans` finds out which. Points are in the world of the layout's poses,
-float64; labels are -1 where the file says that there is none.
+`LAYOUTS` is the table of them; `read_scans` finds out which. Points are in the world of the
+layout's poses, float64; labels are -1 where the file says that there is none.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 from splatseg._check import check_choice
 from splatseg.core import ClassTable
@@ -15,8 +16,15 @@ from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, MissingFileError
 from splatseg.io.captures.kitti360 import window_of
 from splatseg.io.scans._source import Scans as Scans
-from splatseg.io.scans.files import find_files, read_files
-from splatseg.io.scans.kitti import find_kitti_raw, read_kitti_raw
+from splatseg.io.scans.files import find_files, find_range_images, read_files, read_range_images
+from splatseg.io.scans.kitti import (
+    find_kitti_raw,
+    find_odometry,
+    find_semantic_kitti,
+    read_kitti_raw,
+    read_odometry,
+    read_semantic_kitti,
+)
 from splatseg.io.scans.kitti360 import (
     find_accumulated,
     find_sick,
@@ -26,33 +34,43 @@ from splatseg.io.scans.kitti360 import (
     read_velodyne,
 )
 from splatseg.io.scans.nuscenes import find_nuscenes, read_nuscenes
-from splatseg.io.scans.range_images import find_range_images, read_range_images
-from splatseg.io.scans.semantic_kitti import (
-    find_odometry,
-    find_semantic_kitti,
-    read_odometry,
-    read_semantic_kitti,
-)
 from splatseg.io.scans.waymo import find_waymo_scans, read_waymo_scans
 
-_READERS: Mapping[str, tuple[Callable[[Path], object], Callable[[Path], Scans]]] = {
-    "lidar-npz": (find_range_images, read_range_images),
-    "kitti360": (find_velodyne, read_velodyne),
-    "kitti360-sick": (find_sick, read_sick),
-    "kitti360-points": (find_accumulated, read_accumulated),
-    "semantic-kitti": (find_semantic_kitti, read_semantic_kitti),
-    "kitti-odometry": (find_odometry, read_odometry),
-    "kitti-raw": (find_kitti_raw, read_kitti_raw),
-    "waymo": (find_waymo_scans, read_waymo_scans),
-    "nuscenes": (find_nuscenes, read_nuscenes),
-    # Files of points come last: they may lie in the folder of any data set.
-    "las": (lambda path: "las" in find_files(path), partial(read_files, format="las")),
-    "ply": (lambda path: "ply" in find_files(path), partial(read_files, format="ply")),
-    "npz": (lambda path: "npz" in find_files(path), partial(read_files, format="npz")),
-}
 
-FORMATS = tuple(_READERS)
+class Layout(NamedTuple):
+    """How scans of a layout are found and read."""
+
+    name: str
+    find: Callable[[Path], object]
+    """Whether a folder or file has some: anything that counts as true."""
+
+    read: Callable[[Path], Scans]
+
+
+def _files(format: str) -> Layout:
+    return Layout(
+        format, lambda path: format in find_files(path), partial(read_files, format=format)
+    )
+
+
+LAYOUTS = (
+    Layout("lidar-npz", find_range_images, read_range_images),
+    Layout("kitti360", find_velodyne, read_velodyne),
+    Layout("kitti360-sick", find_sick, read_sick),
+    Layout("kitti360-points", find_accumulated, read_accumulated),
+    Layout("semantic-kitti", find_semantic_kitti, read_semantic_kitti),
+    Layout("kitti-odometry", find_odometry, read_odometry),
+    Layout("kitti-raw", find_kitti_raw, read_kitti_raw),
+    Layout("waymo", find_waymo_scans, read_waymo_scans),
+    Layout("nuscenes", find_nuscenes, read_nuscenes),
+    # Files of points come last: they may lie in the folder of any data set.
+    _files("las"),
+    _files("ply"),
+    _files("npz"),
+)
 """Layouts that are read, in the order in which they are looked for."""
+
+FORMATS = tuple(layout.name for layout in LAYOUTS)
 
 
 @boundary
@@ -63,7 +81,7 @@ def read_scans(
 
     Args:
         path: The folder of a drive, or a file of points. Of KITTI-360 a drive, a sensor of it, or
-            a window of frames behind either (see `captures.kitti360_drive`).
+            a window of frames behind either (see `captures.kitti360`).
         format: One of `FORMATS`, or ``auto`` for the first of them that is found.
         classes: Names of the ids of ``semantic``, instead of the format's own. A label that the
             table lacks is refused when its scan is read.
@@ -78,7 +96,7 @@ def read_scans(
         raise MissingFileError(f"{path}: there is no such folder or file of scans.")
     if format == "auto":
         format = find_scans(path)
-    found = _READERS[format][1](path)
+    found = next(layout for layout in LAYOUTS if layout.name == format).read(path)
     return found if classes is None else replace(found, classes=classes)
 
 
@@ -98,4 +116,4 @@ def find_scans(path: Path) -> str:
 @boundary
 def scan_formats(path: Path) -> tuple[str, ...]:
     """Layouts of scans that a folder or file has, the one that would be read first; none is ()."""
-    return tuple(name for name, (found, _) in _READERS.items() if found(path))
+    return tuple(layout.name for layout in LAYOUTS if layout.find(path))

@@ -13,9 +13,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from splatseg.errors import FileFormatError, MissingPackageError
+from splatseg.errors import MissingPackageError
 from splatseg.io.foreign import reading
 from splatseg.io.limits import check_unpacked
+from splatseg.io.schema import expect
 
 _HEADER = 227
 _POINT_BYTES = {
@@ -66,8 +67,8 @@ def check_las_sizes(path: Path) -> None:
         unpacked = sizes.points * sizes.point_bytes
         check_unpacked(path, unpacked, packed=sizes.file, what=what)
         if not sizes.is_packed:
-            if sizes.data + unpacked > sizes.end:
-                raise FileFormatError(f"{path}: expected {what}, but the file ends early.")
+            whole = sizes.data + unpacked <= sizes.end
+            expect(whole, path, f"{what}, but the file ends early")
         elif sizes.points:
             _check_packed(path, file, sizes, records)
 
@@ -76,25 +77,21 @@ def _header(path: Path, file: BinaryIO) -> tuple[_Sizes, dict[tuple[bytes, int],
     """What the header says, and the records before the points."""
     size = path.stat().st_size
     head = file.read(375)
-    if len(head) < _HEADER or head[:4] != b"LASF":
-        raise FileFormatError(f"{path}: expected a LAS file, but its header is not there.")
+    sound = len(head) >= _HEADER and head[:4] == b"LASF"
+    expect(sound, path, "a LAS file, but its header is not there")
     length, data, count = struct.unpack_from("<HII", head, 94)
     format_byte, point_bytes, points = struct.unpack_from("<BHI", head, 104)
     later, extended = size, 0
     if head[25] >= 4 and len(head) == 375:
         first, extended, points = struct.unpack_from("<QIQ", head, 235)
         later = min(size, first) if extended else size
-    least = _POINT_BYTES.get(format_byte & 0x3F)
-    if least is None or point_bytes < least:
-        raise FileFormatError(
-            f"{path}: expected points of formats 0 to 10, of at least 20 to 67 bytes, got format "
-            f"{format_byte & 0x3F} of {point_bytes} bytes."
-        )
-    if not _HEADER <= length <= data <= later:
-        raise FileFormatError(
-            f"{path}: expected header, points and records one after the other in {size} bytes, got "
-            f"them at {length}, {data} and {later}."
-        )
+    format = format_byte & 0x3F
+    what = "points of formats 0 to 10, of at least 20 to 67 bytes"
+    known = format in _POINT_BYTES and point_bytes >= _POINT_BYTES[format]
+    expect(known, path, f"{what}, got format {format} of {point_bytes} bytes")
+    what = f"header, points and records one after the other in {size} bytes"
+    ordered = _HEADER <= length <= data <= later
+    expect(ordered, path, f"{what}, got them at {length}, {data} and {later}")
     records = _records(path, file, length, data, count, extended=False)
     if extended:
         _records(path, file, later, size, extended, extended=True)
@@ -111,18 +108,14 @@ def _records(
     """Records between two places by their owner and number; those behind points are not read."""
     head, layout = (60, "<Q") if extended else (54, "<H")
     found: dict[tuple[bytes, int], bytes] = {}
-    if at + count * head > end:
-        raise FileFormatError(
-            f"{path}: expected records of {head} bytes or more, got {count} of them in "
-            f"{end - at} bytes."
-        )
+    what = f"records of {head} bytes or more, got {count} of them in {end - at} bytes"
+    expect(at + count * head <= end, path, what)
     for _ in range(count):
         file.seek(at)
         start = file.read(head)
         (length,) = struct.unpack_from(layout, start, 20)
         at += head + length
-        if at > end:
-            raise FileFormatError(f"{path}: expected records that end before byte {end}.")
+        expect(at <= end, path, f"records that end before byte {end}")
         if not extended:
             owner, number = struct.unpack_from("<16sH", start, 2)
             found[owner.rstrip(b"\0"), number] = file.read(length)
@@ -134,29 +127,26 @@ def _check_packed(
 ) -> None:
     """Chunks, and the layers of each, must lie in the file."""
     record = records.get(_LASZIP, b"")
-    if len(record) < 34:
-        raise FileFormatError(f"{path}: expected LASzip's record, got none.")
+    expect(len(record) >= 34, path, "LASzip's record, got none")
     packer, chunk, items = struct.unpack("<H10xI16xH", record[:34])
-    if len(record) < 34 + 6 * items:
-        raise FileFormatError(f"{path}: expected {items} parts of a point in LASzip's record.")
+    whole = len(record) >= 34 + 6 * items
+    expect(whole, path, f"{items} parts of a point in LASzip's record")
     parts = [struct.unpack_from("<HH", record, 34 + 6 * i) for i in range(items)]
     extra = (_EXTRA, _EXTRA_LAYERED)
     known = all(kind in extra or _ITEMS.get(kind) == size for kind, size in parts)
     total = sum(size for _, size in parts)
-    if not known or total != sizes.point_bytes or packer not in (_CHUNKED, _LAYERED):
-        raise FileFormatError(
-            f"{path}: expected points of {sizes.point_bytes} bytes in chunks, got parts of {total} "
-            f"in compression {packer}."
-        )
-    if (packer == _LAYERED) != all(kind >= 10 for kind, _ in parts):
-        raise FileFormatError(f"{path}: expected parts that fit compression {packer}.")
+    known = known and total == sizes.point_bytes and packer in (_CHUNKED, _LAYERED)
+    what = f"points of {sizes.point_bytes} bytes in chunks"
+    expect(known, path, f"{what}, got parts of {total} in compression {packer}")
+    fits = (packer == _LAYERED) == all(kind >= 10 for kind, _ in parts)
+    expect(fits, path, f"parts that fit compression {packer}")
     if chunk != _ANY_SIZE:
         unpacked = chunk * sizes.point_bytes
         check_unpacked(path, unpacked, packed=sizes.file, what=f"chunks of {chunk} points")
     begin, table = sizes.data + 8, _table(path, file, sizes)
     chunks = _chunks(path, file, sizes, record, chunk)
-    if sum(length for _, length in chunks) > table - begin:
-        raise FileFormatError(f"{path}: expected chunks of points that end before byte {table}.")
+    inside = sum(length for _, length in chunks) <= table - begin
+    expect(inside, path, f"chunks of points that end before byte {table}")
     if packer == _LAYERED:
         _check_layers(path, file, begin, [length for _, length in chunks], parts)
 
@@ -168,15 +158,13 @@ def _table(path: Path, file: BinaryIO, sizes: _Sizes) -> int:
     if table == -1:  # written at the end where the writer could not go back
         file.seek(sizes.file - 8)
         (table,) = struct.unpack("<q", file.read(8))
-    if not sizes.data + 8 <= table <= sizes.file - 8:
-        raise FileFormatError(f"{path}: expected a table of chunks in the file, got it at {table}.")
+    inside = sizes.data + 8 <= table <= sizes.file - 8
+    expect(inside, path, f"a table of chunks in the file, got it at {table}")
     file.seek(table)
     version, count = struct.unpack("<II", file.read(8))
-    if version or not 1 <= count <= min(sizes.points, table - sizes.data):
-        raise FileFormatError(
-            f"{path}: expected at most a chunk a point, got {count} of {sizes.points} points in "
-            f"{table - sizes.data} bytes."
-        )
+    sound = not version and 1 <= count <= min(sizes.points, table - sizes.data)
+    got = f"{count} of {sizes.points} points in {table - sizes.data} bytes"
+    expect(sound, path, f"at most a chunk a point, got {got}")
     return table
 
 
@@ -194,10 +182,8 @@ def _chunks(
     file.seek(sizes.data)
     chunks = [(int(n), int(size)) for n, size in lazrs.read_chunk_table(file, lazrs.LazVlr(record))]
     held = chunk * len(chunks) if chunk != _ANY_SIZE else sum(n for n, _ in chunks)
-    if held < sizes.points:
-        raise FileFormatError(
-            f"{path}: expected {sizes.points} points, got chunks that hold {held}."
-        )
+    what = f"{sizes.points} points, got chunks that hold {held}"
+    expect(held >= sizes.points, path, what)
     return chunks
 
 
@@ -210,9 +196,7 @@ def _check_layers(
     for length in chunks:
         file.seek(at + first + 4)
         head = file.read(4 * layers)
-        if (
-            len(head) < 4 * layers
-            or first + 4 + 4 * layers + sum(struct.unpack(f"<{layers}I", head)) > length
-        ):
-            raise FileFormatError(f"{path}: expected layers of points within their chunks.")
+        expect(len(head) == 4 * layers, path, "layers of points within their chunks")
+        used = first + 4 + len(head) + sum(struct.unpack(f"<{layers}I", head))
+        expect(used <= length, path, "layers of points within their chunks")
         at += length

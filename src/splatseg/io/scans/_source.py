@@ -6,8 +6,11 @@ same words.
 """
 
 import difflib
-from collections.abc import Callable, Mapping, Sequence
+import re
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +21,15 @@ from numpy.typing import NDArray
 from splatseg.core import UNLABELLED, ClassTable
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.scans import Scan
-from splatseg.errors import FileFormatError, InputError
-from splatseg.io.foreign import made_from
+from splatseg.errors import InputError
+from splatseg.io.foreign import made_from, read_bytes
+from splatseg.io.schema import expect, malformed
 
 MAX_ID = 2**31 - 2
+PIECE = 1_000_000
+"""Points of a file that are read at a time."""
+
+_NUMBER = re.compile(r"[0-9]{1,10}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,6 +56,11 @@ class RawScan:
     """Ids of ``semantic`` that mean nothing, besides negative ones."""
 
     time: float | None = None
+    """Seconds; NaN is none."""
+
+
+Piece = tuple[int, Callable[[int, int], Any]]
+"""How many points a file has, and what reads those of a range."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -78,9 +91,7 @@ class Scans:
 
     def __post_init__(self) -> None:
         convert_fields(self)
-        if len(set(self.scan_names)) != len(self.scan_names):
-            twice = next(n for n in self.scan_names if self.scan_names.count(n) > 1)
-            raise InputError(f"scans: expected distinct names, got {twice!r} more than once.")
+        refuse_twice("scans", self.scan_names, "distinct names")
 
     def __len__(self) -> int:
         return len(self.scan_names)
@@ -117,61 +128,49 @@ def build_scan(name: str, raw: RawScan, classes: ClassTable | None) -> Scan:
     points = np.asarray(raw.points, np.float64)
     recorded = len(points)
     kept = np.ones(recorded, np.bool_) if raw.missing is None else ~raw.missing
-    _check_finite(raw.where, points, kept)
-    if raw.world_from_sensor is not None:
+    finite = np.isfinite(points).all(axis=1) | ~kept
+    expect(
+        finite.all(),
+        raw.where,
+        f"finite positions, got {int((~finite).sum())} of {recorded} that are NaN or infinite, the "
+        f"first at point {int(np.argmin(finite)) if recorded else 0}; a ray without a return has "
+        "a range of 0",
+    )
+    pose = raw.world_from_sensor
+    if pose is not None:
         kept = kept & points.any(axis=1)
-    labels = {
-        key: _ids(raw, key, values, recorded)[kept] for key, values in sorted(raw.labels.items())
-    }
+    labels = {key: _ids(raw, key, ids, recorded)[kept] for key, ids in sorted(raw.labels.items())}
     if classes is not None and "semantic" in labels:
         _check_known(raw.where, labels["semantic"], classes)
     intensity = raw.intensity
-    if intensity is not None and len(intensity) != recorded:
-        raise FileFormatError(
-            f"{raw.where}: expected {recorded} intensities, one a point, got {len(intensity)}."
-        )
-    whole = bool(kept.all())
+    if intensity is not None:
+        count = len(intensity)
+        whole = f"{recorded} intensities, one a point, got {count}"
+        expect(count == recorded, raw.where, whole)
+        intensity = torch.from_numpy(np.nan_to_num(intensity[kept].astype(np.float32)))
+    rows = None if bool(kept.all()) else torch.from_numpy(np.flatnonzero(kept))
     points = points[kept]
-    origin = None
-    if raw.world_from_sensor is not None:
-        pose = raw.world_from_sensor
+    if pose is not None:
         points = points @ pose[:3, :3].T + pose[:3, 3]
-        origin = torch.from_numpy(pose[:3, 3].copy())
     with made_from(raw.where):
         return Scan(
             name=name,
             points=torch.from_numpy(np.ascontiguousarray(points)),
-            rows=None if whole else torch.from_numpy(np.flatnonzero(kept)),
+            rows=rows,
             recorded=recorded,
-            origin=origin,
-            intensity=None
-            if intensity is None
-            else torch.from_numpy(np.nan_to_num(intensity[kept].astype(np.float32))),
+            origin=None if pose is None else torch.from_numpy(pose[:3, 3].copy()),
+            intensity=intensity,
             labels={key: torch.from_numpy(ids) for key, ids in labels.items()},
-            time=raw.time,
-        )
-
-
-def _check_finite(where: object, points: NDArray[np.float64], kept: NDArray[np.bool_]) -> None:
-    finite = np.isfinite(points).all(axis=1) | ~kept
-    if not finite.all():
-        raise FileFormatError(
-            f"{where}: expected finite positions, got {int((~finite).sum())} of {len(points)} "
-            f"that are NaN or infinite, the first at point {int(np.argmin(finite))}; a ray "
-            "without a return has a range of 0."
+            time=None if raw.time is None or not np.isfinite(raw.time) else raw.time,
         )
 
 
 def _ids(raw: RawScan, key: str, values: NDArray[Any], recorded: int) -> NDArray[np.int32]:
     """Ids of memory: negative and void ones become -1; of instances 0 is void."""
-    if len(values) != recorded:
-        raise FileFormatError(
-            f"{raw.where}: expected {recorded} labels ({key}), one a point, got {len(values)}."
-        )
-    if len(values) and int(values.max()) > MAX_ID:
-        raise FileFormatError(
-            f"{raw.where}: expected ids ({key}) up to {MAX_ID}, got {int(values.max())}."
-        )
+    many = f"{recorded} labels ({key}), one a point, got {len(values)}"
+    expect(len(values) == recorded, raw.where, many)
+    highest = int(values.max(initial=0))
+    expect(highest <= MAX_ID, raw.where, f"ids ({key}) up to {MAX_ID}, got {highest}")
     ids = values.astype(np.int64)
     void = raw.void if key == "semantic" else frozenset({0})
     nothing = (ids < 0) | np.isin(ids, sorted(void))
@@ -183,12 +182,21 @@ def _check_known(where: object, ids: NDArray[np.int32], classes: ClassTable) -> 
     known = {row.id for row in classes.rows}
     strange = [(int(i), int(n)) for i, n in zip(present, counts, strict=True) if i not in known]
     if strange:
-        id, count = strange[0]
-        raise FileFormatError(
-            f"{where}: expected labels of the {len(known)} classes of its table, got id {id} of "
-            f"{count} points{f' and {len(strange) - 1} more' if strange[1:] else ''}; give the "
-            "right table with `classes`."
-        )
+        more = f" and {len(strange) - 1} more" if strange[1:] else ""
+        what = f"labels of the {len(known)} classes of its table, got id {strange[0][0]} of "
+        what += f"{strange[0][1]} points{more}; give the right table with `classes`"
+        raise malformed(where, what)
+
+
+def refuse_twice(where: object, names: Iterable[str], what: str) -> None:
+    """Refuse names of which one comes more than once.
+
+    Raises:
+        InputError: With the name.
+    """
+    twice = next((name for name, count in Counter(names).items() if count > 1), None)
+    if twice is not None:
+        raise InputError(f"{where}: expected {what}, got {twice!r:.80} more than once.")
 
 
 def only_one(path: Path, found: Sequence[str], what: str) -> str:
@@ -201,3 +209,76 @@ def only_one(path: Path, found: Sequence[str], what: str) -> str:
         shown = ", ".join(found[:5]) + (", ..." if len(found) > 5 else "")
         raise InputError(f"{path}: expected one {what}, got {len(found)} ({shown}); name one.")
     return found[0]
+
+
+def read_in_pieces(
+    files: Iterable[Path], opened: Callable[[Path], Piece]
+) -> tuple[tuple[str, ...], Callable[[str], tuple[Path, Any]]]:
+    """Names of scans that files are cut into, and what reads one: its file, and what was read.
+
+    A file of at most `PIECE` points is one scan, called as the file; a longer one is NAME_0000,
+    NAME_0001 and so on.
+    """
+    # Pieces of a file follow each other; what was unpacked of it is kept until the next one.
+    cached = lru_cache(maxsize=1)(opened)
+    pieces: dict[str, tuple[Path, int, int]] = {}
+    for file in files:
+        count, _ = cached(file)
+        starts = range(0, max(count, 1), PIECE)
+        for i, start in enumerate(starts):
+            name = file.stem if len(starts) == 1 else f"{file.stem}_{i:04d}"
+            pieces[name] = (file, start, min(count, start + PIECE))
+
+    def read(name: str) -> tuple[Path, Any]:
+        file, start, end = pieces[name]
+        return file, cached(file)[1](start, end)
+
+    return tuple(pieces), read
+
+
+# Numbered files that are nothing but numbers, so many a point: the length is all that can be
+# checked.
+
+
+def numbered_files(folder: Path, suffix: str) -> dict[str, Path]:
+    """Files whose names are numbers, by their names, in the order of the numbers."""
+    files = folder.glob(f"*{suffix}") if folder.is_dir() else ()
+    named = [file for file in files if _NUMBER.fullmatch(file.stem)]
+    return {file.stem: file for file in sorted(named, key=lambda file: (int(file.stem), file.stem))}
+
+
+def skipped(names: Sequence[str], posed: Sequence[str]) -> tuple[str, ...]:
+    """A note on scans that have no pose."""
+    lacking = len(names) - len(posed)
+    return (f"left out: {lacking} of {len(names)} scans that have no pose",) if lacking else ()
+
+
+def read_records(path: Path, columns: int) -> NDArray[np.float32]:
+    """Rows of float32, little endian.
+
+    Raises:
+        MissingFileError: If there is no such file.
+        FileFormatError: If its last row is cut short.
+    """
+    content, width = read_bytes(path, "points of float32"), 4 * columns
+    what = f"points of {columns} float32, {width} bytes each, got {len(content)} bytes"
+    whole = len(content) % width == 0
+    expect(whole, path, f"{what}; the file is cut short or of another format")
+    return np.frombuffer(content, "<f4").reshape(-1, columns).astype(np.float32)
+
+
+def read_ids(path: Path, code: str, *, points: int) -> NDArray[np.int64]:
+    """One whole number a point.
+
+    Args:
+        path: The file.
+        code: NumPy's code of a number, such as ``<u4``.
+        points: How many there must be.
+
+    Raises:
+        MissingFileError: If there is no such file.
+        FileFormatError: If there are more or fewer.
+    """
+    count = len(content := read_bytes(path, "a label a point")) / np.dtype(code).itemsize
+    expect(count == points, path, f"{points} labels, one a point, got {count:g}")
+    return np.frombuffer(content, code).astype(np.int64)

@@ -1,33 +1,76 @@
-"""Scans of KITTI's raw recordings, whose poses come from the satellite and inertial unit.
+"""Scans of KITTI: raw recordings, sequences of the odometry benchmark, SemanticKITTI's labels.
 
     2011_09_26/calib_imu_to_velo.txt                                     rows R (3 x 3) and T
     2011_09_26/2011_09_26_drive_0001_sync/oxts/data/0000000000.txt       lat lon alt roll pitch yaw
     2011_09_26/2011_09_26_drive_0001_sync/velodyne_points/data/0000000000.bin
 
-The world has the axes east, north and up, and its origin at the unit's first position.
+    sequences/00/velodyne/000000.bin    float32 x y z intensity, the scanner's axes
+    sequences/00/labels/000000.label    uint32 a point: 16 bits of class, above them the instance
+    sequences/00/calib.txt              row Tr: the left camera from the scanner
+    sequences/00/poses.txt, or poses/00.txt beside ``sequences``: 3 x 4, of the left camera
+    sequences/00/times.txt              seconds, may lack
+
+The world of a recording has the axes east, north and up, and its origin at the first position of
+the satellite and inertial unit; that of a sequence is the scanner's axes at the first pose of the
+file, x ahead and z up, as semantic-kitti-api puts scans together.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from splatseg.errors import FileFormatError, InputError, MissingFileError
+from splatseg.errors import InputError, MissingFileError
 from splatseg.io.captures.raw_views import checked_pose
 from splatseg.io.foreign import read_lines
-from splatseg.io.scans._source import RawScan, Scans, only_one
-from splatseg.io.scans._velodyne import numbered_files, read_points, skipped
-from splatseg.io.text_numbers import keyed_matrix, read_keyed_numbers, read_times, rigid
+from splatseg.io.label_tables import label_table
+from splatseg.io.scans._source import (
+    RawScan,
+    Scans,
+    numbered_files,
+    only_one,
+    read_ids,
+    read_records,
+    skipped,
+)
+from splatseg.io.schema import malformed
+from splatseg.io.text_numbers import (
+    keyed_matrix,
+    numbers_of,
+    read_keyed_numbers,
+    read_numbers,
+    read_times,
+    rigid,
+    time_at,
+)
 
 EARTH_RADIUS = 6378137.0
 """Metres, at the equator."""
 
-_SCANNER = Path("velodyne_points") / "data"
+_SCANS = Path("velodyne_points") / "data"
 _UNIT = Path("oxts") / "data"
 _CALIBRATION = "calib_imu_to_velo.txt"
 _USED = 6
 _MAX_LATITUDE = 85.0
+
+_VOID = frozenset({0, 1})
+"""unlabeled and outlier."""
+
+_SEQUENCE_SCANS, _LABELS = "velodyne", "labels"
+_CLASS_BITS = 16
+
+
+def read_points(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    """Positions in the sensor's axes (n, 3), and intensities: x, y, z and i in float32.
+
+    Raises:
+        MissingFileError: If there is no such file.
+        FileFormatError: If its last point is cut short.
+    """
+    rows = read_records(path, 4)
+    return rows[:, :3].astype(np.float64), rows[:, 3]
 
 
 def find_kitti_raw(path: Path) -> bool:
@@ -49,12 +92,12 @@ def read_kitti_raw(path: Path) -> Scans:
     found = _recordings(path)
     if not found:
         raise MissingFileError(
-            f"{path}: expected a recording of KITTI, with {_SCANNER.as_posix()} and "
+            f"{path}: expected a recording of KITTI, with {_SCANS.as_posix()} and "
             f"{_UNIT.as_posix()}, got none."
         )
     folders = {folder.name: folder for folder in found}
     folder = folders[only_one(path, list(folders), "recording")]
-    files = numbered_files(folder / _SCANNER, ".bin")
+    files = numbered_files(folder / _SCANS, ".bin")
     packets = numbered_files(folder / _UNIT, ".txt")
     posed = [name for name in files if name in packets]
     if not posed:
@@ -68,22 +111,16 @@ def read_kitti_raw(path: Path) -> Scans:
 
     def read(name: str) -> RawScan:
         points, intensity = read_points(files[name])
-        moment = float(times[int(name)]) if times is not None and int(name) < len(times) else None
         return RawScan(
             where=files[name],
             points=points,
             world_from_sensor=unit_pose(_packet(packets[name]), first) @ unit_from_scanner,
             intensity=intensity,
-            time=moment if moment is not None and np.isfinite(moment) else None,
+            time=time_at(times, int(name)),
         )
 
-    return Scans(
-        path=path,
-        format="kitti-raw",
-        scan_names=tuple(posed),
-        read=read,
-        notes=skipped(list(files), posed),
-    )
+    names, notes = tuple(posed), skipped(list(files), posed)
+    return Scans(path=path, format="kitti-raw", scan_names=names, read=read, notes=notes)
 
 
 def unit_pose(packet: NDArray[np.float64], first: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -99,10 +136,10 @@ def unit_pose(packet: NDArray[np.float64], first: NDArray[np.float64]) -> NDArra
             radians (yaw 0 looks east).
         first: That of the origin.
     """
-    scale = np.cos(np.radians(first[0]))
+    scale = float(np.cos(np.radians(first[0])))
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_euler("ZYX", packet[[5, 4, 3]]).as_matrix()
-    pose[:3, 3] = _place(packet, float(scale)) - _place(first, float(scale))
+    pose[:3, 3] = _place(packet, scale) - _place(first, scale)
     return pose
 
 
@@ -116,15 +153,11 @@ def _place(packet: NDArray[np.float64], scale: float) -> NDArray[np.float64]:
 def _packet(path: Path) -> NDArray[np.float64]:
     """Latitude, longitude, altitude, roll, pitch and yaw of a file of 30 numbers."""
     words = " ".join(read_lines(path, "a packet of the inertial unit")).split()[:_USED]
-    try:
-        values = np.array([float(word) for word in words])
-    except ValueError:
-        values = np.zeros(0)
-    if len(values) < _USED or not np.isfinite(values).all() or abs(values[0]) > _MAX_LATITUDE:
-        raise FileFormatError(
-            f"{path}: expected a packet of the inertial unit, finite numbers that begin with "
-            f"latitude, longitude, altitude, roll, pitch and yaw, got {' '.join(words)!r:.80}."
-        )
+    values = numbers_of(words)
+    sound = values is not None and len(values) == _USED and np.isfinite(values).all()
+    if values is None or not sound or abs(values[0]) > _MAX_LATITUDE:
+        what = "a packet of the inertial unit, finite numbers that begin with latitude, longitude, "
+        raise malformed(path, f"{what}altitude, roll, pitch and yaw", " ".join(words))
     return values
 
 
@@ -147,10 +180,134 @@ def _recordings(path: Path) -> tuple[Path, ...]:
     for folder in (path, *path.absolute().parents[:2]):
         if _is_recording(folder):
             return (folder,)
-    if not path.is_dir():
-        return ()
-    return tuple(sorted(child for child in path.iterdir() if _is_recording(child)))
+    below = path.iterdir() if path.is_dir() else ()
+    return tuple(sorted(child for child in below if _is_recording(child)))
 
 
 def _is_recording(folder: Path) -> bool:
-    return (folder / _SCANNER).is_dir() and (folder / _UNIT).is_dir()
+    return (folder / _SCANS).is_dir() and (folder / _UNIT).is_dir()
+
+
+def find_semantic_kitti(path: Path) -> bool:
+    """Whether a path is a sequence with labels, or the data set's folder with one."""
+    return any((folder / _LABELS).is_dir() for folder in _sequences(path))
+
+
+def find_odometry(path: Path) -> bool:
+    """Whether a path is a sequence of the odometry benchmark, or the data set's folder."""
+    return bool(_sequences(path))
+
+
+def read_semantic_kitti(path: Path) -> Scans:
+    """Scans of a sequence with their labels; a scan without a file of labels has none.
+
+    ``export``'s form ``label`` writes labels back in the order of the scan's file.
+
+    Raises:
+        MissingFileError: If there is no sequence with labels, or poses or calibration lack.
+        InputError: If there are several sequences, or a file is broken.
+    """
+    if not find_semantic_kitti(path):
+        raise MissingFileError(
+            f"{path}: expected a sequence of SemanticKITTI, with {_SEQUENCE_SCANS}, {_LABELS} and "
+            "calib.txt, got none."
+        )
+    return _read_sequence(path, "semantic-kitti")
+
+
+def read_odometry(path: Path) -> Scans:
+    """Scans of a sequence, without labels.
+
+    Raises:
+        MissingFileError: If there is no sequence, or poses or calibration lack.
+        InputError: If there are several sequences, or a file is broken.
+    """
+    if not find_odometry(path):
+        raise MissingFileError(
+            f"{path}: expected a sequence of KITTI's odometry, with {_SEQUENCE_SCANS} and "
+            "calib.txt, got none."
+        )
+    return _read_sequence(path, "kitti-odometry")
+
+
+def _read_sequence(path: Path, format: str) -> Scans:
+    folders = {folder.name: folder for folder in _sequences(path)}
+    folder = folders[only_one(path, list(folders), "sequence")]
+    files = numbered_files(folder / _SEQUENCE_SCANS, ".bin")
+    poses = _sequence_poses(folder)
+    posed = [name for name in files if int(name) < len(poses)]
+    if not posed:
+        raise InputError(
+            f"{path}: expected scans with poses, got {len(files)} scans and {len(poses)} poses."
+        )
+    labelled = format == "semantic-kitti"
+    clock = folder / "times.txt"
+    times = read_numbers(clock, columns=1)[:, 0] if clock.is_file() else None
+
+    def read(name: str) -> RawScan:
+        points, intensity = read_points(files[name])
+        number, file = int(name), folder / _LABELS / f"{name}.label"
+        return RawScan(
+            where=files[name],
+            points=points,
+            world_from_sensor=poses[number],
+            intensity=intensity,
+            labels=_labels(file, len(points)) if labelled and file.is_file() else {},
+            void=_VOID,
+            time=time_at(times, number),
+        )
+
+    return Scans(
+        path=path,
+        format=format,
+        scan_names=tuple(posed),
+        read=read,
+        classes=label_table("semantic-kitti").classes if labelled else None,
+        notes=skipped(list(files), posed),
+    )
+
+
+def _labels(path: Path, points: int) -> Mapping[str, NDArray[np.int64]]:
+    both = read_ids(path, "<u4", points=points)
+    return {"semantic": both & ((1 << _CLASS_BITS) - 1), "instance": both >> _CLASS_BITS}
+
+
+def _sequences(path: Path) -> tuple[Path, ...]:
+    """The sequence that a path is or lies in, else those of the data set's folder."""
+    inside = path.name in (_SEQUENCE_SCANS, _LABELS)
+    for folder in (path, path.parent if inside else path):
+        if _is_sequence(folder):
+            return (folder,)
+    for folder in (path, path / "sequences", path / "dataset" / "sequences"):
+        below = folder.iterdir() if folder.is_dir() else ()
+        found = tuple(sorted(child for child in below if _is_sequence(child)))
+        if found:
+            return found
+    return ()
+
+
+def _is_sequence(folder: Path) -> bool:
+    return (folder / _SEQUENCE_SCANS).is_dir() and (folder / "calib.txt").is_file()
+
+
+def _sequence_poses(folder: Path) -> list[NDArray[np.float64]]:
+    """world_from_scanner of every row."""
+    name = f"{folder.absolute().name}.txt"
+    above = folder.absolute().parents
+    places = (folder / "poses.txt", *(parent / "poses" / name for parent in above[:3]))
+    path = next((place for place in places if place.is_file()), places[0])
+    if not path.is_file():
+        raise MissingFileError(
+            f"{path}: expected the poses of the sequence, there or in poses/{name} above it, got "
+            "none; scans without poses are of no use."
+        )
+    calibration = folder / "calib.txt"
+    matrix = rigid(keyed_matrix(read_keyed_numbers(calibration), "Tr", (3, 4), path=calibration))
+    camera_from_scanner = checked_pose(matrix, where=f"{calibration}: Tr")
+    back = np.linalg.inv(camera_from_scanner)
+    return [
+        back
+        @ checked_pose(rigid(row.reshape(3, 4)), where=f"{path}: row {i + 1}")
+        @ camera_from_scanner
+        for i, row in enumerate(read_numbers(path, columns=12))
+    ]

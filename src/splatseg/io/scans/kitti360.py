@@ -4,12 +4,11 @@
     data_3d_raw/DRIVE/sick_points/data/0000000123.bin        float32, two a point; own numbers
     data_3d_semantics/train/DRIVE/static/0000000002_0000000385.ply    points of the world, labelled
 
-`captures.kitti360_drive` says how a drive, a window of frames and a sensor are named. All of it is
-in the world of the poses, with z up.
+`captures.kitti360` says how a drive, a window of frames and a sensor are named. All of it is in the
+world of the poses, with z up.
 """
 
-from collections.abc import Mapping
-from functools import lru_cache
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from splatseg.errors import FileFormatError, InputError, MissingFileError
+from splatseg.errors import InputError, MissingFileError
 from splatseg.io.captures.kitti360 import (
     ACCUMULATED,
     SCANS,
@@ -32,16 +31,18 @@ from splatseg.io.captures.kitti360 import (
     velodyne_pose,
 )
 from splatseg.io.label_tables import label_table
-from splatseg.io.scans import clouds
-from splatseg.io.scans._records import read_records
-from splatseg.io.scans._source import RawScan, Scans
-from splatseg.io.scans._velodyne import (
+from splatseg.io.scans._source import (
+    RawScan,
+    Scans,
     numbered_files,
-    read_points,
+    read_in_pieces,
+    read_records,
     skipped,
-    unrolled,
 )
-from splatseg.io.text_numbers import read_times
+from splatseg.io.scans.files import ply_pieces, positions, whole_ids
+from splatseg.io.scans.kitti import read_points
+from splatseg.io.schema import expect
+from splatseg.io.text_numbers import read_times, time_at
 
 _MAX_GAP = 3
 """Frames between two poses, beyond which nobody knows how the car went from one to the other."""
@@ -52,12 +53,12 @@ _INSTANCES = 1000
 
 def find_velodyne(path: Path) -> bool:
     """Whether a path names a drive with scans of the turning laser, and nothing else of it."""
-    return _sensor(path, VELODYNE)
+    return _has_sensor(path, VELODYNE)
 
 
 def find_sick(path: Path) -> bool:
     """The same of the lasers that look sideways."""
-    return _sensor(path, SICK)
+    return _has_sensor(path, SICK)
 
 
 def find_accumulated(path: Path) -> bool:
@@ -79,19 +80,15 @@ def read_velodyne(path: Path) -> Scans:
         InputError: If one of these is broken, or no scan has a pose.
     """
     drive = drive_at(path)
-    files = _files(drive, VELODYNE)
-    meant = {name: file for name, file in files.items() if drive.has(int(name))}
-    everywhere = Drive(root=drive.root, name=drive.name)
-    poses = read_poses(everywhere)
+    meant = {n: file for n, file in _files(drive, VELODYNE).items() if drive.has(int(n))}
+    poses = read_poses(Drive(root=drive.root, name=drive.name))
     car_from_laser = velodyne_pose(drive)
-    posed = [name for name in meant if int(name) in poses]
-    _check_posed(drive, path, meant, posed)
+    posed = _posed(drive, path, meant, [name for name in meant if int(name) in poses])
     times = read_times(drive.of(SCANS, VELODYNE, "timestamps.txt"))
 
     def read(name: str) -> RawScan:
         frame = int(name)
         points, intensity = read_points(meant[name])
-        pose = poses[frame] @ car_from_laser
         motion = _motion(poses, frame)
         if motion is not None:
             motion = np.linalg.inv(car_from_laser) @ motion @ car_from_laser
@@ -99,18 +96,35 @@ def read_velodyne(path: Path) -> Scans:
         return RawScan(
             where=meant[name],
             points=points,
-            world_from_sensor=pose,
+            world_from_sensor=poses[frame] @ car_from_laser,
             intensity=intensity,
-            time=_time(times, frame),
+            time=time_at(times, frame),
         )
 
-    return Scans(
-        path=path,
-        format="kitti360",
-        scan_names=tuple(posed),
-        read=read,
-        notes=skipped(list(meant), posed),
-    )
+    notes = skipped(list(meant), posed)
+    return Scans(path=path, format="kitti360", scan_names=posed, read=read, notes=notes)
+
+
+def unrolled(
+    points: NDArray[np.float64], current_from_previous: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    r"""Points of a turning scanner where they were when it looked straight ahead.
+
+    The scanner looks ahead at the moment of the frame's pose, and back half a turn before and
+    after. With :math:`s = \operatorname{atan2}(y, x) / 2\pi` the share of a turn, a point moves
+    by that share of the way back to the previous frame: its rotation vector and its translation
+    are multiplied by s (KITTI-360's accumulation does so).
+
+    Args:
+        points: In the scanner's axes, n x 3.
+        current_from_previous: The previous frame's pose as seen from this one's, 4 x 4.
+    """
+    share = np.arctan2(points[:, 1], points[:, 0])[:, None] / (2 * np.pi)
+    whole = Rotation.from_matrix(current_from_previous[:3, :3]).as_rotvec()
+    turned = Rotation.from_rotvec(share * whole).apply(points) if len(points) else points
+    moved = turned + share * current_from_previous[:3, 3]
+    # A ray without a return is at the sensor, and stays there.
+    return np.where(points.any(axis=1, keepdims=True), moved, points)
 
 
 def read_sick(path: Path) -> Scans:
@@ -130,18 +144,15 @@ def read_sick(path: Path) -> Scans:
     clock, frames = (
         _needed_times(drive.of(SCANS, sensor, "timestamps.txt")) for sensor in (SICK, VELODYNE)
     )
-    poses = {f: p for f, p in read_poses(drive).items() if np.isfinite(_at(frames, f))}
+    poses = {f: p for f, p in read_poses(drive).items() if np.isfinite(time_at(frames, f))}
     if len(poses) < 2:
         raise InputError(
             f"{path}: expected at least two frames with a pose and a time, got {len(poses)}."
         )
     numbers = sorted(poses, key=lambda frame: float(frames[frame]))
     moments = np.array([float(frames[frame]) for frame in numbers])
-    if (np.diff(moments) <= 0).any():
-        raise FileFormatError(
-            f"{drive.of(SCANS, VELODYNE, 'timestamps.txt')}: expected times of distinct frames, "
-            "got one twice."
-        )
+    where = drive.of(SCANS, VELODYNE, "timestamps.txt")
+    expect((np.diff(moments) > 0).all(), where, "times of distinct frames, got one twice")
     car_from_laser = velodyne_pose(drive)
     laser = np.stack([poses[frame] @ car_from_laser for frame in numbers])
     turn = Slerp(moments, Rotation.from_matrix(laser[:, :3, :3]))
@@ -149,14 +160,11 @@ def read_sick(path: Path) -> Scans:
     near = np.diff(numbers) <= _MAX_GAP
 
     def placed(name: str) -> bool:
-        moment = _at(clock, int(name))
+        moment = time_at(clock, int(name))
         after = int(np.searchsorted(moments, moment))
         if not np.isfinite(moment) or after == len(moments):
             return False
         return bool(near[after - 1]) if after else moment == moments[0]
-
-    inside = [name for name in files if placed(name)]
-    _check_posed(drive, path, files, inside)
 
     def read(name: str) -> RawScan:
         moment = float(clock[int(name)])
@@ -168,13 +176,9 @@ def read_sick(path: Path) -> Scans:
         points = np.stack((np.zeros(len(across)), -across[:, 0], across[:, 1]), axis=1)
         return RawScan(where=files[name], points=points, world_from_sensor=pose @ own, time=moment)
 
-    return Scans(
-        path=path,
-        format="kitti360-sick",
-        scan_names=tuple(inside),
-        read=read,
-        notes=skipped(list(files), inside),
-    )
+    inside = _posed(drive, path, files, [name for name in files if placed(name)])
+    notes = skipped(list(files), inside)
+    return Scans(path=path, format="kitti360-sick", scan_names=inside, read=read, notes=notes)
 
 
 def read_accumulated(path: Path) -> Scans:
@@ -195,31 +199,15 @@ def read_accumulated(path: Path) -> Scans:
             f"{path}: expected accumulated points, {ACCUMULATED}/train/{drive.name}/"
             f"{_part(drive)}/START_END.ply, got none."
         )
-    opened = lru_cache(maxsize=1)(clouds.ply_pieces)
-    pieces: dict[str, tuple[Path, int, int]] = {}
-    for file in windows.values():
-        count, _ = opened(file)
-        starts = range(0, max(count, 1), clouds.PIECE)
-        for i, start in enumerate(starts):
-            name = file.stem if len(starts) == 1 else f"{file.stem}_{i:04d}"
-            pieces[name] = (file, start, min(count, start + clouds.PIECE))
+    names, piece = read_in_pieces(windows.values(), ply_pieces)
 
     def read(name: str) -> RawScan:
-        file, start, end = pieces[name]
-        columns = opened(file)[1](start, end)
-        return RawScan(
-            where=file,
-            points=np.stack([columns[axis].astype(np.float64) for axis in "xyz"], axis=1),
-            labels=accumulated_labels(file, columns),
-        )
+        file, columns = piece(name)
+        labels = accumulated_labels(file, columns)
+        return RawScan(where=file, points=positions(columns), labels=labels)
 
-    return Scans(
-        path=path,
-        format="kitti360-points",
-        scan_names=tuple(pieces),
-        read=read,
-        classes=label_table("kitti360").classes,
-    )
+    classes = label_table("kitti360").classes
+    return Scans(path=path, format="kitti360-points", scan_names=names, read=read, classes=classes)
 
 
 def accumulated_labels(
@@ -231,7 +219,7 @@ def accumulated_labels(
         FileFormatError: If an id is no whole number.
     """
     found = {
-        name: clouds.whole_ids(path, name, columns[name])
+        name: whole_ids(path, name, columns[name])
         for name in ("semantic", "instance", "visible")
         if name in columns
     }
@@ -241,7 +229,7 @@ def accumulated_labels(
     return found
 
 
-def _sensor(path: Path, sensor: str) -> bool:
+def _has_sensor(path: Path, sensor: str) -> bool:
     drive = find_drive(path)
     if drive is None or drive.part not in (None, sensor) or drive.top == ACCUMULATED:
         return False
@@ -260,14 +248,15 @@ def _files(drive: Drive, sensor: str) -> dict[str, Path]:
     return files
 
 
-def _check_posed(drive: Drive, path: Path, files: Mapping[str, Path], posed: list[str]) -> None:
+def _posed(
+    drive: Drive, path: Path, files: Mapping[str, Path], posed: Sequence[str]
+) -> tuple[str, ...]:
     if not posed:
-        frames = "" if drive.window is None else f" of frames {drive.window[0]} to "
-        frames += "" if drive.window is None else str(drive.window[1])
         raise InputError(
-            f"{path}: expected scans with poses, got {len(files)} scans{frames} of which none has "
-            "a pose."
+            f"{path}: expected scans with poses, got {len(files)} scans{drive.frames_in_words} of "
+            "which none has a pose."
         )
+    return tuple(posed)
 
 
 def _motion(poses: Mapping[int, NDArray[np.float64]], frame: int) -> NDArray[np.float64] | None:
@@ -287,12 +276,3 @@ def _needed_times(path: Path) -> NDArray[np.float64]:
             "have no pose, got none."
         )
     return times
-
-
-def _at(times: NDArray[np.float64], frame: int) -> float:
-    return float(times[frame]) if frame < len(times) else float("nan")
-
-
-def _time(times: NDArray[np.float64] | None, frame: int) -> float | None:
-    moment = float("nan") if times is None else _at(times, frame)
-    return moment if np.isfinite(moment) else None

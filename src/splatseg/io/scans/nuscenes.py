@@ -9,35 +9,94 @@ tokens; the large ones are read row by row, and only what is of the laser is kep
 CVPR 2020; Fong et al., RA-L 2022; tables as docs/schema_nuscenes.md of nuscenes-devkit has them.
 """
 
-from collections.abc import Callable, Container, Mapping
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from splatseg.core import ClassInfo, ClassTable
-from splatseg.core.json_values import json_integer, json_number
-from splatseg.errors import FileFormatError, MissingFileError, quoted
-from splatseg.io.captures.raw_views import checked_pose
+from splatseg.errors import MissingFileError, quoted
+from splatseg.io.captures.raw_views import checked_pose, pose_of_quaternion
 from splatseg.io.foreign import is_file
 from splatseg.io.json_files import read_json_rows
 from splatseg.io.paths import path_inside
-from splatseg.io.scans._records import read_ids, read_records
-from splatseg.io.scans._source import RawScan, Scans, only_one
+from splatseg.io.scans._source import (
+    RawScan,
+    Scans,
+    only_one,
+    read_ids,
+    read_records,
+    refuse_twice,
+)
+from splatseg.io.schema import Name, Whole, expect, malformed, structured
 
 CHANNEL = "LIDAR_TOP"
-_ENDING = ".pcd.bin"
 _COLUMNS = 5
 _MICROSECOND = 1e-6
 _STUFF = ("flat.", "static.")
-_MAX_CLASS = 255
 _UNIT = 1e-3
-_LONGEST = 150
-"""Characters of the name of a file."""
 
-_Rows = Mapping[str, Mapping[str, Any]]
+_File = Annotated[str, Meta(min_length=1, max_length=150)]
+"""The name of a file, below the root."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Row:
+    token: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Sensor(_Row):
+    channel: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Placed(_Row):
+    """A rigid transform: on the vehicle (calibrated_sensor), or in the world (ego_pose)."""
+
+    translation: tuple[float, float, float]
+    rotation: tuple[float, float, float, float]
+    """A unit quaternion w x y z."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Data(_Row):
+    sample_token: str
+    ego_pose_token: str
+    calibrated_sensor_token: str
+    filename: _File
+    timestamp: Whole
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Sample(_Row):
+    scene_token: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Scene(_Row):
+    name: Name
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Labels(_Row):
+    filename: _File
+    sample_data_token: Name
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Category:
+    name: Name
+    index: Annotated[int, Meta(ge=0, le=255)] | None = None
+
+
+T = TypeVar("T")
+AnyRow = TypeVar("AnyRow", bound=_Row)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,9 +111,8 @@ class _Sweep:
 
 def find_nuscenes(path: Path) -> tuple[str, ...]:
     """Versions whose tables a folder has, by name."""
-    if not path.is_dir():
-        return ()
-    return tuple(sorted(file.parent.name for file in path.glob("v1.0-*/sample_data.json")))
+    tables = path.glob("v1.0-*/sample_data.json") if path.is_dir() else ()
+    return tuple(sorted(file.parent.name for file in tables))
 
 
 def read_nuscenes(path: Path) -> Scans:
@@ -79,10 +137,7 @@ def read_nuscenes(path: Path) -> Scans:
         )
     version = path / only_one(path, versions, "version of tables")
     sweeps = _sweeps(path, version)
-    if not sweeps:
-        raise FileFormatError(
-            f"{version / 'sample_data.json'}: expected key frames of {CHANNEL}, got none."
-        )
+    expect(sweeps, version / "sample_data.json", f"key frames of {CHANNEL}, got none")
     return Scans(
         path=path,
         format="nuscenes",
@@ -93,10 +148,8 @@ def read_nuscenes(path: Path) -> Scans:
 
 
 def _raw(sweep: _Sweep) -> RawScan:
-    points = read_records(sweep.file, _COLUMNS)
-    labels: dict[str, NDArray[Any]] = {}
-    if sweep.labels is not None:
-        labels["semantic"] = read_ids(sweep.labels, "u1", points=len(points))
+    points, file = read_records(sweep.file, _COLUMNS), sweep.labels
+    labels = {} if file is None else {"semantic": read_ids(file, "u1", points=len(points))}
     return RawScan(
         where=sweep.file,
         points=points[:, :3],
@@ -108,122 +161,77 @@ def _raw(sweep: _Sweep) -> RawScan:
 
 
 def _sweeps(root: Path, version: Path) -> dict[str, _Sweep]:
-    sensors = _table(version / "sensor.json", ("channel",))
-    lasers = {token for token, row in sensors.items() if row["channel"] == CHANNEL}
-    mounted = _table(
-        version / "calibrated_sensor.json",
-        ("sensor_token", "translation", "rotation"),
-        kept=lambda row: _is_one_of(row.get("sensor_token"), lasers),
+    def table(
+        name: str, kind: type[AnyRow], kept: Callable[[Mapping[str, Any]], bool] | None = None
+    ) -> dict[str, AnyRow]:
+        return _table(version / f"{name}.json", kind, kept)
+
+    lasers = {t for t, row in table("sensor", _Sensor).items() if row.channel == CHANNEL}
+    mounted = table(
+        "calibrated_sensor", _Placed, lambda row: _is_one_of(row.get("sensor_token"), lasers)
     )
-    data = _table(
-        version / "sample_data.json",
-        ("sample_token", "ego_pose_token", "calibrated_sensor_token", "filename", "timestamp"),
-        kept=lambda row: (
+    data = table(
+        "sample_data",
+        _Data,
+        lambda row: (
             row.get("is_key_frame") is True
             and _is_one_of(row.get("calibrated_sensor_token"), mounted)
         ),
     )
-    asked = {token for row in data.values() if isinstance(token := row["ego_pose_token"], str)}
-    poses = _table(
-        version / "ego_pose.json",
-        ("translation", "rotation"),
-        kept=lambda row: _is_one_of(row.get("token"), asked),
-    )
-    samples = _table(version / "sample.json", ("scene_token",))
-    scenes = _table(version / "scene.json", ("name",))
+    used = {row.ego_pose_token for row in data.values()}
+    poses = table("ego_pose", _Placed, lambda row: _is_one_of(row.get("token"), used))
+    samples, scenes = table("sample", _Sample), table("scene", _Scene)
     labels = _label_files(root, version)
     found: list[tuple[str, int, _Sweep]] = []
     for token, row in data.items():
         where = f"{version / 'sample_data.json'}: {quoted(token)}"
-        sample = _linked(row, "sample_token", samples, where)
-        scene = _text(_linked(sample, "scene_token", scenes, where)["name"], where)
-        vehicle_from_laser = _pose(_linked(row, "calibrated_sensor_token", mounted, where), where)
-        world_from_vehicle = _pose(_linked(row, "ego_pose_token", poses, where), where)
-        time = json_integer(row["timestamp"], where=f"{where}: timestamp")
+        sample = _linked(samples, "sample_token", row.sample_token, where)
+        scene = _linked(scenes, "scene_token", sample.scene_token, where)
+        vehicle_from_laser = _pose(mounted[row.calibrated_sensor_token], where)
+        pose = _linked(poses, "ego_pose_token", row.ego_pose_token, where)
         sweep = _Sweep(
-            file=_named(root, row["filename"], where),
-            world_from_sensor=world_from_vehicle @ vehicle_from_laser,
-            time=time * _MICROSECOND,
+            file=path_inside(root, row.filename, make=False),
+            world_from_sensor=_pose(pose, where) @ vehicle_from_laser,
+            time=row.timestamp * _MICROSECOND,
             labels=labels.get(token),
         )
-        found.append((scene, time, sweep))
+        found.append((scene.name, row.timestamp, sweep))
     found.sort(key=lambda one: one[:2])
     names = [f"{scene}/{time}" for scene, time, _ in found]
-    if len(set(names)) != len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        raise FileFormatError(
-            f"{version / 'sample_data.json'}: expected one key frame of {CHANNEL} a moment, got "
-            f"{quoted(twice)} twice."
-        )
+    refuse_twice(version / "sample_data.json", names, f"one key frame of {CHANNEL} a moment")
     return {name: sweep for name, (_, _, sweep) in zip(names, found, strict=True)}
 
 
-def _is_one_of(token: object, known: Container[str]) -> bool:
+def _is_one_of(token: object, known: "set[str] | Mapping[str, object]") -> bool:
     return isinstance(token, str) and token in known
 
 
 def _table(
-    path: Path,
-    needed: tuple[str, ...],
-    kept: Callable[[Mapping[str, Any]], bool] | None = None,
-) -> dict[str, Mapping[str, Any]]:
-    """Rows of a table by token: those that are wanted, and of them what is needed.
-
-    Raises:
-        FileFormatError: If a wanted row lacks something, or has no token.
-    """
-    found: dict[str, Mapping[str, Any]] = {}
-    for i, row in enumerate(read_json_rows(path)):
-        if kept is not None and not kept(row):
-            continue
-        missing = [name for name in ("token", *needed) if name not in row]
-        if missing:
-            raise FileFormatError(f"{path}: row {i}: expected {missing[0]}, got {quoted(row)}.")
-        token = row["token"]
-        if not isinstance(token, str) or token in found:
-            raise FileFormatError(
-                f"{path}: row {i}: expected a token of its own, got {quoted(token)}."
-            )
-        found[token] = {name: row[name] for name in needed}
+    path: Path, kind: type[AnyRow], kept: Callable[[Mapping[str, Any]], bool] | None = None
+) -> dict[str, AnyRow]:
+    """Rows of a table by token, those that are wanted."""
+    found: dict[str, AnyRow] = {}
+    for i, content in enumerate(read_json_rows(path)):
+        if kept is None or kept(content):
+            row = structured(content, kind, where=f"{path}: row {i}")
+            expect(row.token not in found, f"{path}: row {i}", "a token of its own", row.token)
+            found[row.token] = row
     return found
 
 
-def _linked(row: Mapping[str, Any], key: str, table: _Rows, where: str) -> Mapping[str, Any]:
-    token: object = row[key]
-    if not isinstance(token, str) or token not in table:
-        raise FileFormatError(
-            f"{where}: expected {key} of a row that is there, got {quoted(token)}."
-        )
+def _linked(table: Mapping[str, T], key: str, token: str, where: str) -> T:
+    if token not in table:
+        raise malformed(where, f"{key} of a row that is there", token)
     return table[token]
-
-
-def _text(value: object, where: str) -> str:
-    if not isinstance(value, str) or not value:
-        raise FileFormatError(f"{where}: expected a name, got {quoted(value)}.")
-    return value
-
-
-def _named(root: Path, value: object, where: str) -> Path:
-    """A file that a table names, below the root."""
-    name = _text(value, where)
-    if len(name) > _LONGEST:
-        raise FileFormatError(f"{where}: expected the name of a file, got {quoted(name)}.")
-    return path_inside(root, name, make=False)
 
 
 def _label_files(root: Path, version: Path) -> dict[str, Path]:
     """Files of labels by the token of their scan; none where there is no lidarseg."""
     path = version / "lidarseg.json"
-    if not is_file(path):
-        return {}
-    found: dict[str, Path] = {}
-    for token, row in _table(path, ("filename", "sample_data_token")).items():
-        where = f"{path}: {quoted(token)}"
-        file = _named(root, row["filename"], where)
-        # The tables of the test split name files that were never published.
-        if is_file(file):
-            found[_text(row["sample_data_token"], where)] = file
-    return found
+    rows = _table(path, _Labels).values() if is_file(path) else ()
+    files = {row.sample_data_token: path_inside(root, row.filename, make=False) for row in rows}
+    # The tables of the test split name files that were never published.
+    return {token: file for token, file in files.items() if is_file(file)}
 
 
 def _classes(version: Path) -> ClassTable | None:
@@ -231,42 +239,19 @@ def _classes(version: Path) -> ClassTable | None:
     path = version / "category.json"
     if not is_file(path):
         return None
-    rows: list[ClassInfo] = []
-    for i, row in enumerate(read_json_rows(path)):
-        if "index" not in row:
+    rows: dict[int, ClassInfo] = {}
+    for i, content in enumerate(read_json_rows(path)):
+        row = structured(content, _Category, where=f"{path}: row {i}")
+        if row.index is None:
             return None
-        where = f"{path}: row {i}"
-        id = json_integer(row["index"], where=f"{where}: index", high=_MAX_CLASS)
-        name = _text(row.get("name"), where)
-        if id:
-            rows.append(ClassInfo(id=id, name=name, isthing=not name.startswith(_STUFF)))
-    if len({row.id for row in rows}) != len(rows):
-        raise FileFormatError(f"{path}: expected distinct indices, got one twice.")
-    return ClassTable(rows=tuple(sorted(rows, key=lambda row: row.id)))
+        expect(row.index not in rows, path, "distinct indices, got one twice")
+        isthing = not row.name.startswith(_STUFF)
+        rows[row.index] = ClassInfo(id=row.index, name=row.name, isthing=isthing)
+    return ClassTable(rows=tuple(rows[id] for id in sorted(rows) if id))
 
 
-def _pose(row: Mapping[str, Any], where: str) -> NDArray[np.float64]:
-    """A rigid transform of a translation and a unit quaternion w x y z."""
-    values: dict[str, list[float]] = {}
-    for name, count in (("translation", 3), ("rotation", 4)):
-        value: object = row[name]
-        if not isinstance(value, list) or len(value) != count:
-            raise FileFormatError(
-                f"{where}: expected {count} numbers in {name}, got {quoted(value)}."
-            )
-        values[name] = [json_number(number, where=f"{where}: {name}") for number in value]
-    w, x, y, z = values["rotation"]
-    length = float(np.sqrt(w * w + x * x + y * y + z * z))
-    if abs(length - 1) > _UNIT:
-        raise FileFormatError(
-            f"{where}: expected a unit quaternion as rotation, got one of length {length:g}."
-        )
-    w, x, y, z = w / length, x / length, y / length, z / length
-    pose = np.eye(4)
-    pose[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    pose[:3, 3] = values["translation"]
-    return checked_pose(pose, where=where)
+def _pose(row: _Placed, where: str) -> NDArray[np.float64]:
+    length = math.hypot(*row.rotation)
+    what = f"a unit quaternion as rotation, got one of length {length:g}"
+    expect(abs(length - 1) <= _UNIT, where, what)
+    return checked_pose(pose_of_quaternion((*row.rotation, *row.translation)), where=where)

@@ -12,14 +12,12 @@ the rotation Rz(yaw) Ry(pitch) Rx(roll). Sun et al., CVPR 2020; as waymo_open_da
 
 import math
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from splatseg.errors import FileFormatError
 from splatseg.io.captures.waymo_segment import (
     LASERS,
     LIDAR,
@@ -34,7 +32,9 @@ from splatseg.io.captures.waymo_segment import (
 )
 from splatseg.io.captures.waymo_tfrecord import ENDING
 from splatseg.io.parquet import Row, RowReader, integer_of, list_of, number_of, read_rows
-from splatseg.io.scans._source import RawScan, Scans
+from splatseg.io.scans._source import RawScan, Scans, refuse_twice
+from splatseg.io.scans.files import directions
+from splatseg.io.schema import expect, malformed
 
 CALIBRATIONS = "lidar_calibration"
 POSES = "lidar_pose"
@@ -123,9 +123,8 @@ def labelled_scans(path: Path) -> tuple[str, ...]:
     segment = one_segment(path)
     if not segment.has(SEGMENTATION):
         return ()
-    return tuple(
-        scan_name(key) for key in sorted(_Images(segment.component(SEGMENTATION), _LABELS).keys)
-    )
+    keys = _Images(segment.component(SEGMENTATION), _LABELS).keys
+    return tuple(scan_name(key) for key in sorted(keys))
 
 
 def scan_name(key: Key) -> str:
@@ -149,11 +148,7 @@ class _Images:
             for row in read_rows(path, (TIMESTAMP, LASER))
         ]
         self.keys = {key: i for i, key in enumerate(keys)}
-        if len(self.keys) != len(keys):
-            twice = next(key for key in keys if keys.count(key) > 1)
-            raise FileFormatError(
-                f"{path}: expected one range image a frame and laser, got {scan_name(twice)} twice."
-            )
+        refuse_twice(path, map(scan_name, keys), "one range image a frame and laser")
         self._reader = RowReader(path, self._names)
 
     def array(
@@ -165,6 +160,8 @@ class _Images:
             FileFormatError: If its values are not as many as its shape says, or its shape is
                 not the one that is expected.
         """
+        if key not in self.keys:
+            return None
         row = self._reader.row(self.keys[key])
         values, shape = self._names
         if row[values] is None:
@@ -173,15 +170,10 @@ class _Images:
         sides = [int(side) for side in list_of(row, shape, where=where, count=3)]
         flat = list_of(row, values, where=where)
         expected = [*(like or sides[:2]), channels]
-        if sides != expected or min(sides) < 1:
-            raise FileFormatError(
-                f"{where}: expected {' x '.join(map(str, expected))} values, got the shape "
-                f"{' x '.join(map(str, sides))}."
-            )
-        if len(flat) != math.prod(sides):
-            raise FileFormatError(
-                f"{where}: expected {' x '.join(map(str, sides))} values, got {len(flat)}."
-            )
+        what, got = (" x ".join(map(str, some)) for some in (expected, sides))
+        fits = sides == expected and min(sides) >= 1
+        expect(fits, where, f"{what} values, got the shape {got}")
+        expect(len(flat) == math.prod(sides), where, f"{what} values, got {len(flat)}")
         return flat.reshape(sides)
 
 
@@ -193,37 +185,25 @@ def _raw(
     optional: dict[str, _Images],
 ) -> RawScan:
     where = f"{ranges.path}: {scan_name(key)}"
-    if key.laser not in lasers:
-        raise FileFormatError(
-            f"{where}: expected one of the lasers {sorted(lasers)} of {CALIBRATIONS}."
-        )
-    if key.time not in segment.vehicle_poses:
-        raise FileFormatError(f"{where}: expected the pose of this frame in {VEHICLE_POSES}.")
+    lasers_there = f"one of the lasers {sorted(lasers)} of {CALIBRATIONS}"
+    expect(key.laser in lasers, where, lasers_there)
+    posed = key.time in segment.vehicle_poses
+    expect(posed, where, f"the pose of this frame in {VEHICLE_POSES}")
     image = ranges.array(key, 4)
     if image is None:
-        raise FileFormatError(f"{where}: expected a range image of first returns, got none.")
+        raise malformed(where, "a range image of first returns, got none")
     sides = image.shape[:2]
     laser = lasers[key.laser]
     world_from_laser = segment.placed(segment.vehicle_poses[key.time]) @ laser.vehicle_from_laser
     distance = _finite(image[..., 0], "ranges", where=where)
-    points = distance[..., None] * _directions(laser, sides, where=where)
+    points = distance[..., None] * _beams(laser, sides, where=where)
     missing = distance <= 0
-    part = {name: (images, partial(images.array, key)) for name, images in optional.items()}
-    moments = None
-    if POSES in part and key in part[POSES][0].keys:
-        moments = part[POSES][1](6, sides)
+    moments = optional[POSES].array(key, 6, sides) if POSES in optional else None
     if moments is not None:
-        points[~missing] = _at_moments(
-            points[~missing],
-            _finite(moments[~missing], f"poses in {POSES}", where=where),
-            segment,
-            laser,
-            world_from_laser,
-        )
+        poses = _finite(moments[~missing], f"poses in {POSES}", where=where)
+        points[~missing] = _at_moments(points[~missing], poses, segment, laser, world_from_laser)
+    found = optional[SEGMENTATION].array(key, 2, sides) if SEGMENTATION in optional else None
     labels: dict[str, NDArray[Any]] = {}
-    found = None
-    if SEGMENTATION in part and key in part[SEGMENTATION][0].keys:
-        found = part[SEGMENTATION][1](2, sides)
     if found is not None:
         unlabelled = image[..., 3] > 0
         for channel, name in enumerate(("instance", "semantic")):
@@ -241,29 +221,22 @@ def _raw(
 
 def _finite(values: NDArray[Any], what: str, *, where: str) -> NDArray[np.float64]:
     strange = int((~np.isfinite(values)).sum())
-    if strange:
-        raise FileFormatError(
-            f"{where}: expected finite {what}, got {strange} numbers of {values.size} that are NaN "
-            "or infinite; where nothing came back the range is 0 or less."
-        )
+    what = f"finite {what}, got {strange} numbers of {values.size} that are NaN or infinite"
+    expect(not strange, where, f"{what}; where nothing came back the range is 0 or less")
     return values.astype(np.float64)
 
 
-def _directions(laser: Laser, sides: Sequence[int], *, where: str) -> NDArray[np.float64]:
+def _beams(laser: Laser, sides: Sequence[int], *, where: str) -> NDArray[np.float64]:
     """Unit directions of the values of a range image in the laser's axes, H x W x 3."""
     rows, columns = sides
     beams = laser.inclinations
     if beams is None:
         beams = laser.least + (laser.most - laser.least) * (np.arange(rows) + 0.5) / rows
-    if len(beams) != rows:
-        raise FileFormatError(
-            f"{where}: expected {len(beams)} rows, as {CALIBRATIONS} has beams, got {rows}."
-        )
-    e = beams[::-1, None]
+    what = f"{len(beams)} rows, as {CALIBRATIONS} has beams, got {rows}"
+    expect(len(beams) == rows, where, what)
     turned = math.atan2(laser.vehicle_from_laser[1, 0], laser.vehicle_from_laser[0, 0])
     a = (2 * (columns - np.arange(columns) - 0.5) / columns - 1)[None, :] * np.pi - turned
-    z = np.broadcast_to(np.sin(e), (rows, columns))
-    return np.stack((np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), z), axis=-1)
+    return directions(beams[::-1, None], a)
 
 
 def _at_moments(
@@ -307,6 +280,6 @@ def _inclinations(row: Row, column: str, *, where: str) -> NDArray[np.float64] |
     if value is None or (isinstance(value, np.ndarray) and not value.size):
         return None
     beams = list_of(row, column, where=where).astype(np.float64)
-    if not np.isfinite(beams).all():
-        raise FileFormatError(f"{where}: expected finite inclinations, got NaN or infinity.")
+    finite = np.isfinite(beams).all()
+    expect(finite, where, "finite inclinations, got NaN or infinity")
     return beams

@@ -19,8 +19,8 @@ def _read(path: Path) -> None:
     for view in evidence.view_names:
         evidence.masks(view)
         if isinstance(evidence, AnnotationEvidence):
-            evidence.given("labels").label_map(view)
-            evidence.given("panoptic").segments(view)
+            evidence.as_kind("labels").label_map(view)
+            evidence.as_kind("panoptic").segments(view)
         elif evidence.kind == "labels":
             evidence.label_map(view)
 

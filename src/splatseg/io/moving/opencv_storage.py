@@ -13,6 +13,7 @@
 What is not asked for is not kept.
 """
 
+import re
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatseg.core.json_values import MAX_NUMBER
-from splatseg.errors import FileFormatError, quoted, reason
+from splatseg.errors import quoted
+from splatseg.io.schema import expect, malformed
+from splatseg.io.text_numbers import numbers_of
 from splatseg.io.xml_files import read_xml
 
 _KIND = "XML of OpenCV"
@@ -57,15 +60,9 @@ class StoredObject:
             FileFormatError: If there is none.
         """
         word = self.text(name)
-        try:
-            value = int(word) if len(word) <= 18 else None
-        except ValueError:
-            value = None
-        if value is None:
-            raise FileFormatError(
-                f"{self.where}: {name}: expected a whole number, got {quoted(word)}."
-            )
-        return value
+        sound = re.fullmatch(r"[-+]?[0-9]{1,18}", word)
+        expect(sound, f"{self.where}: {name}", "a whole number", word)
+        return int(word)
 
     def matrix(self, name: str) -> NDArray[np.float64]:
         """The matrix of an element.
@@ -75,19 +72,16 @@ class StoredObject:
                 columns say, or one of them is NaN or infinite.
         """
         rows, columns = self.whole(f"{name}.rows"), self.whole(f"{name}.cols")
-        words = self.texts.get(f"{name}.data", "").split()
-        try:
-            values = np.array([float(word) for word in words])
-        except ValueError as error:
-            raise FileFormatError(f"{self.where}: {name}: {reason(error)}.") from error
-        if min(rows, columns) < 1 or len(values) != rows * columns:
-            raise FileFormatError(
-                f"{self.where}: {name}: expected {rows} x {columns} numbers, got {len(values)}."
-            )
-        if not (np.abs(values) <= MAX_NUMBER).all():
-            raise FileFormatError(
-                f"{self.where}: {name}: expected finite numbers up to {MAX_NUMBER:g}, got others."
-            )
+        where, values = (
+            f"{self.where}: {name}",
+            numbers_of(self.texts.get(f"{name}.data", "").split()),
+        )
+        if values is None:
+            raise malformed(where, "numbers, got other words")
+        fits = min(rows, columns) >= 1 and len(values) == rows * columns
+        expect(fits, where, f"{rows} x {columns} numbers, got {len(values)}")
+        finite = (np.abs(values) <= MAX_NUMBER).all()
+        expect(finite, where, f"finite numbers up to {MAX_NUMBER:g}, got others")
         return values.reshape(rows, columns)
 
 
@@ -130,13 +124,12 @@ class _Found:
 
     def start(self, name: str, attributes: dict[str, str]) -> None:
         self._names.append(name)
-        if self._names[0] != _ROOT or len(self._names) > _DEEPEST:
-            raise FileFormatError(f"{self._where}: expected {_KIND}, got other elements.")
+        known = self._names[0] == _ROOT and len(self._names) <= _DEEPEST
+        expect(known, self._where, f"{_KIND}, got other elements")
         if len(self._names) == 2:
             self._texts, self._kept = {}, 0
         key = ".".join(self._names[2:])
-        if key in self._texts:
-            raise FileFormatError(f"{self._where}: expected {key} once, got it twice.")
+        expect(key not in self._texts, self._where, f"{key} once, got it twice")
         self._key = key if key in self._wanted else None
         if self._key is not None:
             self._texts[key] = []
@@ -145,10 +138,8 @@ class _Found:
         if self._key is None:
             return
         self._kept += len(text)
-        if self._kept > _LONGEST:
-            raise FileFormatError(
-                f"{self._where}: expected at most {_LONGEST} characters of an object, got more."
-            )
+        what = f"at most {_LONGEST} characters of an object, got more"
+        expect(self._kept <= _LONGEST, self._where, what)
         self._texts[self._key].append(text)
 
     def end(self, name: str) -> None:
