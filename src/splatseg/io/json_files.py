@@ -108,9 +108,6 @@ def write_json(value: Mapping[str, Any], path: Path) -> None:
         temporary.write_text(text + "\n", encoding="utf-8", newline="\n")
 
 
-# Lists of objects in JSON, read row by row: a table may be larger than memory.
-
-
 _CHUNK = 1 << 20
 _MAX_ROW = 1 << 24
 """Characters of one row; those of real tables have a thousand."""

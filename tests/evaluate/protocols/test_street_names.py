@@ -4,7 +4,7 @@ import pytest
 
 from splatseg.evaluate.protocols import TABLE_1, street_class
 from splatseg.io.benchmarks.kitti360 import EVALUATED
-from splatseg.io.captures.waymo_segment import CAMERA_CLASSES, LIDAR_CLASSES
+from splatseg.io.captures.waymo import CAMERA_CLASSES, LIDAR_CLASSES
 from splatseg.io.label_tables import label_table
 
 KITTI = [row.name for row in EVALUATED.rows]

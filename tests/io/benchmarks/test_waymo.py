@@ -6,7 +6,7 @@ import pytest
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.io.benchmarks import find_layout, read_benchmark
 from splatseg.io.captures import read_capture
-from splatseg.io.captures.waymo_segment import CAMERA_CLASSES, LIDAR_CLASSES
+from splatseg.io.captures.waymo import CAMERA_CLASSES, LIDAR_CLASSES
 from support.benchmark_layouts import read_source, write_layout
 from support.benchmark_layouts.evidence import write_evidence
 from support.benchmark_layouts.waymo import CAMERA_NAMES

@@ -8,8 +8,8 @@ import torch
 
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.io.captures import bare_photographs, find_formats, read_capture
-from splatseg.io.captures.idr import decompose
 from splatseg.io.captures.points import read_ply_points
+from splatseg.io.captures.pose_tables import decompose
 from support.layouts import write_idr, write_llff
 
 

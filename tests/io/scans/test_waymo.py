@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from splatseg.errors import FileFormatError, InputError, MissingFileError
-from splatseg.io.captures.waymo_segment import LIDAR_CLASSES
+from splatseg.io.captures.waymo import LIDAR_CLASSES
 from splatseg.io.scans import find_scans, read_scans
 from splatseg.io.scans.waymo import labelled_scans
 from support.benchmark_layouts import read_source, write_layout

@@ -12,7 +12,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from splatseg.core import View
-from splatseg.io.captures.waymo_segment import CAMERA_CLASSES, LIDAR_CLASSES
+from splatseg.io.captures.waymo import CAMERA_CLASSES, LIDAR_CLASSES
 from support.benchmark_layouts.source import Source
 from support.waymo_files import LENS, frame, image, write_component
 

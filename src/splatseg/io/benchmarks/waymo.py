@@ -24,13 +24,16 @@ from splatseg.core import (
 )
 from splatseg.errors import FileFormatError, MissingFileError
 from splatseg.io.benchmarks._masks import check_proportions
-from splatseg.io.captures.waymo import CAMERA, find_waymo, photograph_name, read_waymo
-from splatseg.io.captures.waymo_segment import (
+from splatseg.io.captures.waymo import (
+    CAMERA,
     CAMERA_CLASSES,
     LIDAR_CLASSES,
     TIMESTAMP,
     WaymoSegment,
     find_segments,
+    find_waymo,
+    photograph_name,
+    read_waymo,
 )
 from splatseg.io.foreign import made_from, reading
 from splatseg.io.limits import check_unpacked

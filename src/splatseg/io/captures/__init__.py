@@ -13,8 +13,6 @@ from splatseg.core import Capture, PointCloud
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, MissingFileError
 from splatseg.io.captures.colmap import find_colmap, read_colmap
-from splatseg.io.captures.idr import FILES as IDR_FILES
-from splatseg.io.captures.idr import find_idr, read_idr
 from splatseg.io.captures.kitti360 import find_kitti360, read_kitti360
 from splatseg.io.captures.nerfstudio import (
     BLENDER_FILE,
@@ -28,16 +26,19 @@ from splatseg.io.captures.points import Metadata as Metadata
 from splatseg.io.captures.points import finite_points, read_ply_points
 from splatseg.io.captures.points import read_metadata as read_metadata
 from splatseg.io.captures.pose_tables import (
+    IDR_FILES,
     LLFF_FILE,
     REPLICA_FILE,
+    find_idr,
     find_replica,
     find_scannet,
+    read_idr,
     read_llff,
     read_replica,
     read_scannet,
 )
+from splatseg.io.captures.waymo import SUFFIX as _WAYMO_SUFFIX
 from splatseg.io.captures.waymo import find_waymo, read_waymo
-from splatseg.io.captures.waymo_segment import SUFFIX as _WAYMO_SUFFIX
 from splatseg.io.captures.waymo_tfrecord import ENDING as _TFRECORD
 from splatseg.io.images import find_images
 

@@ -4,8 +4,8 @@
     FILE.components/                                written here: the components of perception v2
 
 A frame is turned into rows of the components of version 2, and what is read then is those, see
-`waymo_segment`. Numbers of fields are those of dataset.proto of waymo_open_dataset (Apache-2.0),
-which was read for them.
+`io.captures.waymo`. Numbers of fields are those of dataset.proto of waymo_open_dataset
+(Apache-2.0), which was read for them.
 """
 
 import zlib

@@ -36,7 +36,7 @@ from splatseg.core.moving import MovingBox
 from splatseg.core.rigid import quaternion_from_rotation
 from splatseg.errors import MissingFileError
 from splatseg.io.captures.kitti360 import SCANS, VELODYNE, Drive, find_drive
-from splatseg.io.captures.waymo_segment import (
+from splatseg.io.captures.waymo import (
     BOXES,
     MICROSECOND,
     SUFFIX,
@@ -48,11 +48,11 @@ from splatseg.io.captures.waymo_segment import (
 from splatseg.io.captures.waymo_tfrecord import ENDING
 from splatseg.io.foreign import is_file, is_folder, made_from
 from splatseg.io.json_files import read_json, write_json
-from splatseg.io.moving.opencv_storage import StoredObject, stored_objects
 from splatseg.io.moving.views import CLOCKS, Clock
 from splatseg.io.parquet import Row, integer_of, number_of, read_rows
 from splatseg.io.schema import expect, malformed, structured
 from splatseg.io.text_numbers import frame_time, read_times, time_at
+from splatseg.io.xml_files import StoredObject, stored_objects
 
 FOLDER = "data_3d_bboxes"
 _SPLITS = ("train_full", "train")

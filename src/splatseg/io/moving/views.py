@@ -20,7 +20,7 @@ from splatseg.core.view_names import frame_number
 from splatseg.errors import FileFormatError, InputError
 from splatseg.io.captures.kitti360 import SCANS, VELODYNE, find_drive
 from splatseg.io.captures.nerfstudio import FILE
-from splatseg.io.captures.waymo_segment import MICROSECOND
+from splatseg.io.captures.waymo import MICROSECOND
 from splatseg.io.evidence import Evidence
 from splatseg.io.images import load_mask, save_png
 from splatseg.io.json_files import read_json

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from splatseg.io.captures.waymo_segment import (
+from splatseg.io.captures.waymo import (
     LASERS,
     LIDAR,
     LIDAR_CLASSES,
