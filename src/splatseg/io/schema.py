@@ -147,6 +147,8 @@ def structured(value: object, kind: type[T], *, where: object, strict: bool = Tr
         found = _converted(value, kind, strict=strict)
     except msgspec.ValidationError as error:
         raise FileFormatError(_sentence(value, kind, str(error), where)) from error
+    except RecursionError as error:
+        raise malformed(where, "values within each other, got too many") from error
     check = _finite(kind)
     if check is not None:
         check(found, str(where))
