@@ -270,11 +270,11 @@ def test_masks_in_an_npz(tmp_path) -> None:
         ({"masks": dense[0]}, "shape \\(masks, height, width\\)"),
         ({"masks": dense.astype(np.float32)}, "booleans"),
         ({"masks": -dense.astype(np.int8)}, "booleans"),
-        ({"masks": dense, "scores": [0.5]}, "a finite score for each of 2"),
-        ({"masks": dense, "levels": [1]}, "level for each of 2"),
+        ({"masks": dense, "scores": [0.5]}, r"scores of shape \(2,\)"),
+        ({"masks": dense, "levels": [1]}, r"levels of shape \(2,\)"),
         ({"masks": dense, "levels": [1, 2**31]}, "level for each of 2"),
-        ({"masks": dense, "levels": [1, np.nan]}, "level for each of 2"),
-        ({"masks": dense, "scores": [0.5, np.nan]}, "a finite score"),
+        ({"masks": dense, "levels": [1, np.nan]}, "finite levels"),
+        ({"masks": dense, "scores": [0.5, np.nan]}, "finite scores"),
         ({"other": dense}, "expected an array 'masks', got other"),
     ]:
         np.savez(folder / "v0.npz", **wrong)

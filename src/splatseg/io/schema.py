@@ -70,7 +70,7 @@ _KINDS = {
     "iuf": "numbers",
     "iu": "whole numbers",
     "f": "real numbers",
-    "b": "booleans",
+    "bui": "booleans or whole numbers",
     "U": "text",
 }
 
