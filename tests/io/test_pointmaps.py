@@ -68,9 +68,9 @@ def test_a_pair_or_a_photograph_that_is_not_there(tmp_path) -> None:
     ("header", "words"),
     [
         ({"version": 2}, "of version 1, got 'splatseg-pointmaps' of version 2"),
-        ({"photographs": "a.jpg"}, "photographs as a list of file names"),
+        ({"photographs": "a.jpg"}, "photographs: expected a list"),
         ({"photographs": ["a", "a"]}, "distinct photographs"),
-        ({"metadata": 3}, "metadata as an object"),
+        ({"metadata": 3}, "metadata: expected an object"),
     ],
 )
 def test_headers_that_are_none(tmp_path, header, words: str) -> None:
@@ -83,12 +83,12 @@ def test_headers_that_are_none(tmp_path, header, words: str) -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"points_1": np.zeros((3, 4, 2), "f4")}, r"points: expected shape \(any, any, 3\)"),
-        ({"points_1": np.zeros((3, 4, 3), "i4")}, "as real numbers, got int32"),
+        ({"points_1": np.zeros((3, 4, 2), "f4")}, r"points_1 of shape \(rows, columns, 3\)"),
+        ({"points_1": np.zeros((3, 4, 3), "i4")}, "in real numbers, got int32"),
         ({"points_2": np.zeros((0, 4, 3), "f4")}, "1 to 16384 a side"),
         ({"points_2": np.full((3, 4, 3), np.nan, "f4")}, "36 of 36 values are not finite"),
         ({"confidence_2": np.full((3, 4), 0.5, "f4")}, r"expected values in \[1, inf\], got 0.5"),
-        ({"confidence_1": np.ones((4, 3), "f4")}, r"confidence: expected shape \(3, 4\)"),
+        ({"confidence_1": np.ones((4, 3), "f4")}, r"confidence_1 of shape \(3, 4\)"),
     ],
 )
 def test_maps_that_are_none(tmp_path, change, words: str) -> None:

@@ -319,8 +319,8 @@ def test_the_split_of_scene_json_counts(version_1) -> None:
     ("change", "message"),
     [
         (lambda c: c.pop("frames"), "expected a list of frames"),
-        (lambda c: c["frames"][0].pop("name"), r"frames\[0\]: expected a name"),
-        (lambda c: c.pop("fl_x"), "fl_x: expected a finite number"),
+        (lambda c: c["frames"][0].pop("name"), r"frames\[0\]: expected a field name"),
+        (lambda c: c.pop("fl_x"), "expected a number fl_x, got none"),
         (lambda c: c["frames"][1]["transform_matrix"].pop(), "finite|last row|4 x 4|rotation"),
         (lambda c: c["frames"].__setitem__(0, 3), r"frames\[0\]: expected an object"),
     ],
