@@ -20,7 +20,7 @@ _LONE = re.compile("[\ud800-\udfff]")
 def parse_object(text: str | bytes, *, where: str) -> dict[str, Any]:
     """A JSON object from text; `where` starts the message of an error.
 
-    Its numbers are unchecked: `core.json_numbers` takes them out.
+    Its numbers are unchecked: `io.schema` and `core.json_values` take them out.
 
     Raises:
         FileFormatError: If it is not JSON, holds something other than an object, or text in it is
@@ -118,7 +118,7 @@ _SPACE = re.compile(r"[ \t\r\n]*")
 def read_json_rows(path: Path) -> Iterator[dict[str, Any]]:
     """The objects of a file that is one JSON list of objects, in its order.
 
-    Their numbers are unchecked: `core.json_numbers` takes them out.
+    Their numbers are unchecked: `io.schema` and `core.json_values` take them out.
 
     Raises:
         MissingFileError: If there is no such file.

@@ -12,34 +12,12 @@ from splatseg._check import check_choice
 from splatseg.core import Capture, PointCloud
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, MissingFileError
-from splatseg.io.captures.colmap import find_colmap, read_colmap
-from splatseg.io.captures.kitti360 import find_kitti360, read_kitti360
-from splatseg.io.captures.nerfstudio import (
-    BLENDER_FILE,
-    FILE,
-    find_scannetpp,
-    read_blender,
-    read_nerfstudio,
-    read_scannetpp,
-)
+from splatseg.io.captures import colmap, kitti360, nerfstudio, waymo
+from splatseg.io.captures import pose_tables as tables
 from splatseg.io.captures.points import Metadata as Metadata
 from splatseg.io.captures.points import finite_points, read_ply_points
 from splatseg.io.captures.points import read_metadata as read_metadata
-from splatseg.io.captures.pose_tables import (
-    IDR_FILES,
-    LLFF_FILE,
-    REPLICA_FILE,
-    find_idr,
-    find_replica,
-    find_scannet,
-    read_idr,
-    read_llff,
-    read_replica,
-    read_scannet,
-)
-from splatseg.io.captures.waymo import SUFFIX as _WAYMO_SUFFIX
-from splatseg.io.captures.waymo import find_waymo, read_waymo
-from splatseg.io.captures.waymo_tfrecord import ENDING as _TFRECORD
+from splatseg.io.captures.waymo_tfrecord import ENDING
 from splatseg.io.images import find_images
 
 
@@ -66,17 +44,26 @@ class Layout(NamedTuple):
     """Of files that are captures by themselves."""
 
 
+def _has(file: str | Path) -> Callable[[Path], bool]:
+    return lambda folder: (folder / file).is_file()
+
+
 LAYOUTS = (
-    Layout("nerfstudio", lambda path: (path / FILE).is_file(), read_nerfstudio, (FILE,)),
-    Layout("blender", lambda path: (path / BLENDER_FILE).is_file(), read_blender, (BLENDER_FILE,)),
-    Layout("colmap", find_colmap, read_colmap),
-    Layout("llff", lambda path: (path / LLFF_FILE).is_file(), read_llff, (LLFF_FILE,)),
-    Layout("idr", find_idr, read_idr, IDR_FILES),
-    Layout("replica", find_replica, read_replica, (REPLICA_FILE,)),
-    Layout("scannet", find_scannet, read_scannet),
-    Layout("scannetpp", find_scannetpp, read_scannetpp),
-    Layout("kitti360", find_kitti360, read_kitti360),
-    Layout("waymo", find_waymo, read_waymo, suffixes=(_WAYMO_SUFFIX, _TFRECORD)),
+    Layout("nerfstudio", _has(nerfstudio.FILE), nerfstudio.read_nerfstudio, (nerfstudio.FILE,)),
+    Layout(
+        "blender",
+        _has(nerfstudio.BLENDER_FILE),
+        nerfstudio.read_blender,
+        (nerfstudio.BLENDER_FILE,),
+    ),
+    Layout("colmap", colmap.find_colmap, colmap.read_colmap),
+    Layout("llff", _has(tables.LLFF_FILE), tables.read_llff, (tables.LLFF_FILE,)),
+    Layout("idr", tables.find_idr, tables.read_idr, tables.IDR_FILES),
+    Layout("replica", tables.find_replica, tables.read_replica, (tables.REPLICA_FILE,)),
+    Layout("scannet", tables.find_scannet, tables.read_scannet),
+    Layout("scannetpp", nerfstudio.find_scannetpp, nerfstudio.read_scannetpp),
+    Layout("kitti360", kitti360.find_kitti360, kitti360.read_kitti360),
+    Layout("waymo", waymo.find_waymo, waymo.read_waymo, suffixes=(waymo.SUFFIX, ENDING)),
 )
 """Layouts that are read, in the order in which they are looked for."""
 
@@ -117,7 +104,7 @@ def read_capture(path: Path | str, *, format: str = "auto", strict: bool = False
     """
     check_choice("format", format, ("auto", *FORMATS))
     folder = Path(path)
-    window = not folder.is_dir() and find_kitti360(folder)
+    window = not folder.is_dir() and kitti360.find_kitti360(folder)
     if folder.is_file() and not window:
         folder, named = _from_file(folder)
         format = named if format == "auto" else format

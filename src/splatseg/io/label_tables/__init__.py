@@ -12,10 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from splatseg.core import ClassInfo, ClassTable
-from splatseg.errors import FileFormatError, InputError, quoted
+from splatseg.errors import InputError
 from splatseg.io.class_tables import class_table
 from splatseg.io.foreign import read_lines
 from splatseg.io.json_files import read_json
+from splatseg.io.schema import malformed
 
 TABLES = ("ade20k", "coco", "cityscapes", "scannet", "kitti360", "semantic-kitti", "voc")
 """Data sets whose tables are known by name."""
@@ -95,10 +96,8 @@ def _colour_lines(path: Path) -> LabelTable:
             continue
         found = _LABELMAP_LINE.fullmatch(line) or _CAMVID_LINE.fullmatch(line)
         if found is None:
-            raise FileFormatError(
-                f"{path}: expected a class and its colour a line (car:128,0,0:: or 128 0 0 car), "
-                f"got {quoted(line)}."
-            )
+            what = "a class and its colour a line (car:128,0,0:: or 128 0 0 car)"
+            raise malformed(path, what, line)
         colour = [int(word) for word in re.split(r"[\s,]+", found["colour"])]
         rows.append({"id": len(rows), "name": found["name"].strip(), "colour": colour})
     if rows and not is_void_name(str(rows[0]["name"])):

@@ -15,26 +15,8 @@ from splatseg.core import ClassTable
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, MissingFileError
 from splatseg.io.captures.kitti360 import window_of
+from splatseg.io.scans import files, kitti, kitti360, nuscenes, waymo
 from splatseg.io.scans._source import Scans as Scans
-from splatseg.io.scans.files import find_files, find_range_images, read_files, read_range_images
-from splatseg.io.scans.kitti import (
-    find_kitti_raw,
-    find_odometry,
-    find_semantic_kitti,
-    read_kitti_raw,
-    read_odometry,
-    read_semantic_kitti,
-)
-from splatseg.io.scans.kitti360 import (
-    find_accumulated,
-    find_sick,
-    find_velodyne,
-    read_accumulated,
-    read_sick,
-    read_velodyne,
-)
-from splatseg.io.scans.nuscenes import find_nuscenes, read_nuscenes
-from splatseg.io.scans.waymo import find_waymo_scans, read_waymo_scans
 
 
 class Layout(NamedTuple):
@@ -48,25 +30,22 @@ class Layout(NamedTuple):
 
 
 def _files(format: str) -> Layout:
-    return Layout(
-        format, lambda path: format in find_files(path), partial(read_files, format=format)
-    )
+    read = partial(files.read_files, format=format)
+    return Layout(format, lambda path: format in files.find_files(path), read)
 
 
 LAYOUTS = (
-    Layout("lidar-npz", find_range_images, read_range_images),
-    Layout("kitti360", find_velodyne, read_velodyne),
-    Layout("kitti360-sick", find_sick, read_sick),
-    Layout("kitti360-points", find_accumulated, read_accumulated),
-    Layout("semantic-kitti", find_semantic_kitti, read_semantic_kitti),
-    Layout("kitti-odometry", find_odometry, read_odometry),
-    Layout("kitti-raw", find_kitti_raw, read_kitti_raw),
-    Layout("waymo", find_waymo_scans, read_waymo_scans),
-    Layout("nuscenes", find_nuscenes, read_nuscenes),
+    Layout("lidar-npz", files.find_range_images, files.read_range_images),
+    Layout("kitti360", kitti360.find_velodyne, kitti360.read_velodyne),
+    Layout("kitti360-sick", kitti360.find_sick, kitti360.read_sick),
+    Layout("kitti360-points", kitti360.find_accumulated, kitti360.read_accumulated),
+    Layout("semantic-kitti", kitti.find_semantic_kitti, kitti.read_semantic_kitti),
+    Layout("kitti-odometry", kitti.find_odometry, kitti.read_odometry),
+    Layout("kitti-raw", kitti.find_kitti_raw, kitti.read_kitti_raw),
+    Layout("waymo", waymo.find_waymo_scans, waymo.read_waymo_scans),
+    Layout("nuscenes", nuscenes.find_nuscenes, nuscenes.read_nuscenes),
     # Files of points come last: they may lie in the folder of any data set.
-    _files("las"),
-    _files("ply"),
-    _files("npz"),
+    *(_files(format) for format in ("las", "ply", "npz")),
 )
 """Layouts that are read, in the order in which they are looked for."""
 
