@@ -40,7 +40,10 @@ Whole = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 
 Name = Annotated[str, Meta(min_length=1)]
 
-_Check = Callable[[Any, str], None]
+_Bad = tuple[str, float] | None
+"""Where in a value a number is that is none, and the number."""
+
+_Check = Callable[[Any], _Bad]
 _NOTHING = object()
 _MAX_WHOLE = 2**53
 _PLACE = re.compile(r"^(?P<what>.*?)(?: - at `(?:key in )?\$(?P<at>.*)`)?$", re.DOTALL)
@@ -150,8 +153,9 @@ def structured(value: object, kind: type[T], *, where: object, strict: bool = Tr
     except RecursionError as error:
         raise malformed(where, "values within each other, got too many") from error
     check = _finite(kind)
-    if check is not None:
-        check(found, str(where))
+    bad = None if check is None else check(found)
+    if bad is not None:
+        raise malformed(_place(where, bad[0]), f"a finite number up to {MAX_NUMBER:g}", bad[1])
     return found
 
 
@@ -193,7 +197,8 @@ def _finite(kind: Any) -> _Check | None:
         if inner is None:
             return None
         return _check_numbers if inner is _check_number else functools.partial(_check_items, inner)
-    return functools.partial(_check_fields, kind) if is_dataclass(kind) else None
+    declared = isinstance(kind, type) and is_dataclass(kind)
+    return functools.partial(_check_fields, kind) if declared else None
 
 
 @functools.cache
@@ -206,30 +211,43 @@ def _plain_type(kind: Any) -> Any:
     return typing.get_args(kind)[0] if typing.get_origin(kind) is Annotated else kind
 
 
-def _check_number(value: float, where: str) -> None:
-    expect(abs(value) <= MAX_NUMBER, where, f"a finite number up to {MAX_NUMBER:g}", value)
+def _check_number(value: float) -> _Bad:
+    return None if abs(value) <= MAX_NUMBER else ("", value)
 
 
-def _check_numbers(values: Any, where: str) -> None:
+def _check_numbers(values: Any) -> _Bad:
     listed = values.values() if isinstance(values, dict) else values
-    if not all(abs(value) <= MAX_NUMBER for value in listed):
-        _check_items(_check_number, values, where)
+    if all(abs(value) <= MAX_NUMBER for value in listed):
+        return None
+    return _check_items(_check_number, values)
 
 
-def _check_items(check: _Check, values: Any, where: str) -> None:
+def _check_items(check: _Check, values: Any) -> _Bad:
     for key, value in values.items() if isinstance(values, dict) else enumerate(values):
-        check(value, f"{where}[{quoted(key)}]")
+        if (bad := check(value)) is not None:
+            return f"[{quoted(key)}]{bad[0]}", bad[1]
+    return None
 
 
-def _check_fields(kind: type[Any], value: Any, where: str) -> None:
+def _check_fields(kind: type[Any], value: Any) -> _Bad:
     for name, check in _number_fields(kind):
-        check(getattr(value, name), f"{where}: {name}")
+        if (bad := check(getattr(value, name))) is not None:
+            return f".{name}{bad[0]}", bad[1]
+    return None
 
 
-def _check_union(members: Sequence[tuple[type, _Check]], value: Any, where: str) -> None:
+def _check_union(members: Sequence[tuple[type, _Check]], value: Any) -> _Bad:
     for cls, check in members:
-        if isinstance(value, cls):
-            check(value, where)
+        if isinstance(value, cls) and (bad := check(value)) is not None:
+            return bad
+    return None
+
+
+def _place(where: object, at: str) -> str:
+    """A file and a place in it: ``FILE: frames[3].w``."""
+    if not at or at.startswith("["):
+        return f"{where}{at}"
+    return f"{where}: {at.removeprefix('.')}"
 
 
 def _sentence(value: object, kind: type[Any], message: str, where: object) -> str:
@@ -238,8 +256,7 @@ def _sentence(value: object, kind: type[Any], message: str, where: object) -> st
     steps = [name or index for name, index in _STEP.findall(at)]
     if "..." in steps:
         steps = _with_keys(value, kind, steps)
-    shown = "".join(f"[{s}]" if s.isdigit() else f".{s}" for s in steps).removeprefix(".")
-    place = f"{where}{'' if shown.startswith('[') else ': '}{shown}" if shown else str(where)
+    place = _place(where, "".join(f"[{s}]" if s.isdigit() else f".{s}" for s in steps))
     missing = _MISSING.match(what)
     if missing is not None:
         return f"{place}: expected a field {missing[1]}, got none."

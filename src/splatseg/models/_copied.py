@@ -63,7 +63,7 @@ def copied(
     """
     evidence = model.evidence
     if isinstance(evidence, AnnotationEvidence):
-        evidence = evidence.as_kind(AREA_KINDS.get(what or "", evidence.kind))
+        evidence = evidence.as_kind(AREA_KINDS.get(what or "", evidence.annotations.kind))
     if what is not None and evidence.kind not in _ASKED.get(what, ()):
         raise InputError(f"{evidence.folder}: expected evidence of {what}, got {evidence.kind}.")
     there = frozenset(evidence.view_names)

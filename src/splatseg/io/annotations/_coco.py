@@ -103,7 +103,7 @@ class _Categories:
         return {} if self.classes is None else {row.id: row.isthing for row in self.classes.rows}
 
     def id_of(self, own: int | None, *, where: str) -> int:
-        if own not in self.ids:
+        if own is None or own not in self.ids:
             raise malformed(where, "one of the file's categories as category_id", own)
         return self.ids[own]
 

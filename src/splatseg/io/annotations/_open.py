@@ -162,6 +162,10 @@ def _refuse(words: str, path: Path, _: Any) -> Annotations:
     raise FileFormatError(f"{path}: expected {words}.")
 
 
+def _labelme_file(path: Path, _: Any) -> Annotations:
+    return labelme_annotations(path, [path])
+
+
 def _is_datumaro(content: object) -> bool:
     return isinstance(content, dict) and "items" in content and "categories" in content
 
@@ -176,7 +180,7 @@ _TOOLS = (
     ),
     _Tool(is_label_studio, label_studio_annotations),
     _Tool(is_dataset, coco_dataset),
-    _Tool(is_labelme, lambda path, _: labelme_annotations(path, [path])),
+    _Tool(is_labelme, _labelme_file),
     _Tool(
         _is_datumaro,
         partial(

@@ -145,7 +145,9 @@ class Canvas:
         check_unpacked(self.where, pixels * _BYTES_OF_PIXEL, packed=self.packed, what=what)
 
 
-def corners_of(numbers: Sequence[float] | None, *, where: str) -> NDArray[np.float64]:
+def corners_of(
+    numbers: Sequence[float] | NDArray[np.float64] | None, *, where: str
+) -> NDArray[np.float64]:
     """Corners (n, 2) of an outline: x, y, x, y, ...; None is no numbers.
 
     Raises:

@@ -208,6 +208,7 @@ def check_map_sizes(evidence: Evidence, views: Iterable[View]) -> None:
         FileFormatError: If a map has more than four times the pixels of its photograph.
     """
     maps = evidence.maps if isinstance(evidence, TableEvidence) else evidence
-    for view in views if isinstance(maps, LabelEvidence) else ():
-        if view.name in maps.files:
-            check_size(maps.files[view.name], view)
+    if isinstance(maps, LabelEvidence):
+        for view in views:
+            if view.name in maps.files:
+                check_size(maps.files[view.name], view)

@@ -268,7 +268,8 @@ class StaticScans:
         times: Mapping[str, float] | None = None,
     ) -> None:
         self._scans, self._boxes, self._margin = scans, tuple(boxes), margin
-        self._times, self._clock = dict(times or {}), clock
+        self._times = dict(times or {})
+        self._clock: Clock = clock
 
     @property
     def scan_names(self) -> Sequence[str]:

@@ -30,8 +30,10 @@ class Layout(NamedTuple):
 
 
 def _files(format: str) -> Layout:
-    read = partial(files.read_files, format=format)
-    return Layout(format, lambda path: format in files.find_files(path), read)
+    def find(path: Path) -> bool:
+        return format in files.find_files(path)
+
+    return Layout(format, find, partial(files.read_files, format=format))
 
 
 LAYOUTS = (
