@@ -138,34 +138,20 @@ def _sheet(figures: DemoFigures, held_out: Gallery, classes: ClassTable) -> Tens
 
 def _figures(figures: DemoFigures, scene: Scene) -> tuple[Figure, ...]:
     before, after = figures.came.miou, figures.test["mIoU"]
-    return (
-        Figure(
-            "Pictures of held-out views",
-            f"{figures.test['PSNR']:.1f} dB",
-            f"PSNR, mean of {counted(figures.test['photographs'], 'view')}; "
-            f"SSIM {figures.test['SSIM']:.3f}",
-        ),
-        Figure(
-            "Labels as they came", f"{before:.3f}", "pooled mIoU of the machine labels, train views"
-        ),
-        Figure(
-            "Labels lifted and rendered",
-            f"{after:.3f}",
-            f"pooled mIoU on held-out views, {100 * (after - before):+.1f} points",
-        ),
-        Figure(
-            "Objects, from masks without weights",
-            f"{figures.objects['mIoU']:.3f}",
-            "instance mIoU on held-out views; "
-            f"{figures.objects['predicted_instances']} found, "
-            f"{figures.objects['truth_instances']} true ones",
-        ),
-        Figure(
-            "Gaussians",
-            count_text(len(scene.gaussians)),
-            f"from {len(scene.train_views)} photographs",
-        ),
-    )
+    test, objects = figures.test, figures.objects
+    rows = (
+        ("Pictures of held-out views", f"{test['PSNR']:.1f} dB",
+         f"PSNR, mean of {counted(test['photographs'], 'view')}; SSIM {test['SSIM']:.3f}"),
+        ("Labels as they came", f"{before:.3f}", "pooled mIoU of the machine labels, train views"),
+        ("Labels lifted and rendered", f"{after:.3f}",
+         f"pooled mIoU on held-out views, {100 * (after - before):+.1f} points"),
+        ("Objects, from masks without weights", f"{objects['mIoU']:.3f}",
+         f"instance mIoU on held-out views; {objects['predicted_instances']} found, "
+         f"{objects['truth_instances']} true ones"),
+        ("Gaussians", count_text(len(scene.gaussians)),
+         f"from {len(scene.train_views)} photographs"),
+    )  # fmt: skip
+    return tuple(Figure(*row) for row in rows)
 
 
 def _held_out_gallery(
@@ -185,39 +171,28 @@ def _held_out_gallery(
     depths = [_read(renders / "depth" / f"{view.name}.png").double() * unit for view in views]
     far = max(float(depth.max()) for depth in depths)
     rows: list[tuple[str, tuple[GalleryImage, ...]]] = []
+    columns: tuple[str, ...] = ()
     for view, depth in zip(views, depths, strict=True):
         photograph = load_image(view)
         drawn = _read(renders / "rgb" / f"{view.name}.png").to(torch.uint8)
         ids = _ids(renders / layer / f"{view.name}.png")
         things = _ids(renders / objects / f"{view.name}.png")
         true = truth.label_map(view.name).ids
-        rows.append(
-            (
-                view.name,
-                (
-                    GalleryImage(photograph),
-                    GalleryImage(drawn, f"{psnr(drawn, photograph):.1f} dB"),
-                    GalleryImage(colour_depth(depth, near=0.3, far=far)),
-                    _labels(ids, scene.classes),
-                    _labels(true, scene.classes),
-                    GalleryImage(
-                        mark_errors(photograph, ids, truth=true), f"{_right(ids, true):.1%} right"
-                    ),
-                    GalleryImage(draw_ids(colour_labels(things, colours), things), kind="chart"),
-                ),
-            )
-        )
+        errors = mark_errors(photograph, ids, truth=true)
+        pictures = {
+            "photograph": GalleryImage(photograph),
+            "rendered": GalleryImage(drawn, f"{psnr(drawn, photograph):.1f} dB"),
+            "depth": GalleryImage(colour_depth(depth, near=0.3, far=far)),
+            "labels, rendered": _labels(ids, scene.classes),
+            "truth": _labels(true, scene.classes),
+            "errors in red": GalleryImage(errors, f"{_right(ids, true):.1%} right"),
+            "objects": GalleryImage(draw_ids(colour_labels(things, colours), things), kind="chart"),
+        }
+        columns = tuple(pictures)
+        rows.append((view.name, tuple(pictures.values())))
     return Gallery(
         "Held-out views",
-        (
-            "photograph",
-            "rendered",
-            "depth",
-            "labels, rendered",
-            "truth",
-            "errors in red",
-            "objects",
-        ),
+        columns,
         tuple(rows),
         note="No photograph and no label of these views was used before. Objects come from masks "
         "that need no weights, joined in 3D; objects.html in scene/reports shows each of "
@@ -232,17 +207,13 @@ def _train_gallery(scene: Scene, truth: Evidence, came: Evidence, labels: Labels
         true = truth.label_map(view.name).ids
         before = came.label_map(view.name).ids
         after = label_map(scene.gaussians, view.camera, labels).ids
-        rows.append(
-            (
-                view.name,
-                (
-                    GalleryImage(load_image(view)),
-                    _labels(before, scene.classes, right=_right(before, true)),
-                    _labels(after, scene.classes, right=_right(after, true)),
-                    _labels(true, scene.classes),
-                ),
-            )
+        pictures = (
+            GalleryImage(load_image(view)),
+            _labels(before, scene.classes, right=_right(before, true)),
+            _labels(after, scene.classes, right=_right(after, true)),
+            _labels(true, scene.classes),
         )
+        rows.append((view.name, pictures))
     return Gallery(
         "What lifting mends",
         ("photograph", "labels as they came", "lifted and rendered", "truth"),
@@ -291,7 +262,7 @@ def _step_table(figures: DemoFigures) -> Table:
 def _facts(folder: Path, scene: Scene, seed: int) -> dict[str, Any]:
     capture = read_json(folder / "capture" / "metadata.json")
     return {
-        "room": f"splatseg.synthetic.furnishing(seed={seed})",
+        "room": f"splatseg.synthetic.room(seed={seed})",
         "photographs": f"{len(scene.train_views)} train and {len(scene.test_views)} held out, "
         f"{capture['width']} x {capture['height']} pixels",
         "fit": f"{scene.provenance.get('steps')} steps",

@@ -237,7 +237,8 @@ def with_sightings(
 ) -> tuple[ObjectFacts, ...]:
     """The same with where each is seen best; those with most Gaussians, then pixels, first."""
     found = [replace(one, seen=seen.get(one.id)) for one in objects]
-    found.sort(key=lambda one: (-(one.gaussians or 0), -_pixels(one), one.id))
+    pixels = {one.id: 0 if one.seen is None else one.seen.pixels for one in found}
+    found.sort(key=lambda one: (-(one.gaussians or 0), -pixels[one.id], one.id))
     return tuple(found)
 
 
@@ -288,20 +289,12 @@ def _counted(labels: Labels) -> tuple[dict[int, int], dict[int, float]]:
     )
 
 
-def _pixels(one: ObjectFacts) -> int:
-    return 0 if one.seen is None else one.seen.pixels
-
-
 def _facts(one: ObjectFacts) -> tuple[tuple[str, str], ...]:
-    facts: list[tuple[str, str]] = []
-    if one.class_name is not None and one.class_name != one.name:
-        facts.append(("class", one.class_name))
-    if one.gaussians is not None:
-        facts.append(("Gaussians", count_text(one.gaussians)))
-    if one.confidence is not None:
-        facts.append(("confidence", f"{one.confidence:.2f}"))
-    if one.seen is not None:
-        facts.append(("view", one.seen.view))
-    if one.file is not None:
-        facts.append(("file", one.file.rpartition("/")[2]))
-    return tuple(facts)
+    facts = {
+        "class": None if one.class_name == one.name else one.class_name,
+        "Gaussians": None if one.gaussians is None else count_text(one.gaussians),
+        "confidence": None if one.confidence is None else f"{one.confidence:.2f}",
+        "view": None if one.seen is None else one.seen.view,
+        "file": None if one.file is None else one.file.rpartition("/")[2],
+    }
+    return tuple((name, value) for name, value in facts.items() if value is not None)
