@@ -195,7 +195,7 @@ def test_an_edit_says_what_was_done(made, tmp_path) -> None:
     cut = EditOptions(extract=True, layer="classes", ids=(id,), cut="layer")
     done = edit_scene(document, tmp_path / "cut", options=cut, backend="cpu")
     assert done.operations[0]["split"] > 0
-    assert done.operations[0]["views"] == 4
+    assert done.operations[0]["views"] == 3
     undone = edit_scene(
         load_document(tmp_path / "cut"), tmp_path / "back", options=EditOptions(undo=True)
     )
