@@ -33,7 +33,7 @@ from splatseg.methods.uplift import UpliftMethodOptions
 from splatseg.tasks.benchmark import BenchOptions, BenchRun, bench
 from splatseg.tasks.benchmark.chosen import BySelection
 from splatseg.tasks.benchmark.prompts import stroke_prompt
-from splatseg.tasks.sources import Offer, OpenedSource, open_source
+from splatseg.tasks.sources import OpenedSource, SourceRequest, open_source
 from support.red_square import NAMES, SIZE, camera, save_strokes, wall
 
 SQUARE, WALL, ALL = 2, 3, 1
@@ -147,7 +147,7 @@ def test_features_trained_as_published_answer_as_published(
     """Thresholds of section 3.4 and what follows in section 3.5, by the record of the layer."""
     asked: list[tuple[str | None, bool]] = []
 
-    def opened(offer: Offer) -> OpenedSource:
+    def opened(offer: SourceRequest) -> OpenedSource:
         found = open_source(offer)
         asked.append((found.rule, found.published))
         return found
