@@ -214,7 +214,7 @@ def refusals(labelled, tmp_path):
         ((*whole, "--scores", "s.json"), "--scores: this option was removed; AP50 ranks all"),
         ((*whole, "--photographs"), "--photographs: this option was removed; renders are"),
         ((*whole, "--instances", "nothing"), "nothing"),
-        ((*whole, "--classes", tmp_path / "no.json"), "no.json"),
+        ((*whole, "--classes", tmp_path / "no.json"), "or a JSON file, got"),
         ((*whole, "--metadata", "m.json"), "--metadata: this option was removed; --classes takes"),
         ((*whole, "--truth-instances", tmp_path / "part"), "part: expected evidence"),
         ((*layer, "--points", tmp_path / "no.npz"), "no.npz"),

@@ -21,7 +21,7 @@ MAKE = {
     "see", "segment", "select", "sharpen", "street",
 }  # fmt: skip
 TELL = {"doctor", "info"}
-OWN_HELP = {"frames": ["fit"], "data CAPTURE": ["import"], "seed": ["attach", "demo"]}
+OWN_HELP = {"frames": ["fit"], "seed": ["attach", "demo"]}
 
 
 def help_of(page: str, flag: str) -> str | None:
@@ -166,7 +166,7 @@ def test_json_of_the_main_job(small, splatseg, tmp_path) -> None:
     )
     assert Path(exported["output"]) == out
     assert Path(exported["table"]).is_file()
-    figures = one_object(splatseg("evaluate", scene, "--photographs", *cpu, "--json"))
+    figures = one_object(splatseg("evaluate", scene, *cpu, "--json"))
     assert figures["PSNR"] > 30
     quick = ("--sharpen-steps", 4, "--decide-every", 2, "--rates-from", 0)
     sharp = one_object(

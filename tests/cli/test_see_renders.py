@@ -210,11 +210,11 @@ def test_backend(imported, splatseg, monkeypatch, backend) -> None:
     asked: set[str] = set()
 
     class Field:
-        def __init__(self, gaussians: Gaussians, **options: str) -> None:
+        def __init__(self, gaussians: Gaussians, layers: object, **options: str) -> None:
             asked.add(options["backend"])
             raise KeyboardInterrupt
 
-    monkeypatch.setattr("splatseg.tasks.see.GaussianField", Field)
+    monkeypatch.setattr("splatseg.tasks.work.GaussianField", Field)
     splatseg("see", imported, *CLASSICAL, "--backend", backend)
     assert asked == {backend}
 

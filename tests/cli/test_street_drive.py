@@ -168,7 +168,7 @@ def test_what_is_wrong_is_one_sentence(made, generated_drive, boxes, splatseg, t
     root = shutil.copytree(made, tmp_path / "scene")
     before = sorted((root / "fields").rglob("*"))
     new = ("--field", "b")
-    assert "--block-overlap: expected less than a block of 9 m, got 9 m" in refused(
+    assert "--block-overlap: expected less than 9 m, got 9 m" in refused(
         *new, "--block-length", "9", "--block-overlap", "9"
     )
     assert "--block-overlap: expected a length of blocks" in refused(*new, "--block-overlap", "9")

@@ -208,7 +208,12 @@ def test_the_command_hands_its_flags_on(monkeypatch, tmp_path) -> None:
     command = Command(
         data=tmp_path,
         output=tmp_path,
-        capture=fit._Scene(moving=Path("b.json"), moving_classes=("car",)),
+        capture=fit._Scene(
+            moving=Path("b.json"),
+            moving_classes=("car",),
+            moving_evidence="maps",
+            moving_clock="frames",
+        ),
     )
     with pytest.raises(Stop):
         run(command)

@@ -143,7 +143,7 @@ def write_edit_report(
         "operations": [dict(operation) for operation in operations],
         "views": list(pictures.views),
     }
-    write_page(page, folder / "edit.html", record)
+    write_page(page, folder / "edit.html", record=record)
 
 
 def edit_sentence(operation: Mapping[str, Any]) -> str:

@@ -387,7 +387,7 @@ def score_and_report(
     spent = {**(timings or {}), "scores and report": time.monotonic() - began}
     data = replace(data, timings=spent)
     page = fit_report(data, pairs=pairs, cameras=cameras)
-    where = write_page(page, scene_path(root, REPORTS_FOLDER, "fit.html"), fit_record(data))
+    where = write_page(page, scene_path(root, REPORTS_FOLDER, "fit.html"), record=fit_record(data))
     return FittedScene(scores=scores, report=where, verdict=verdict_of(data), timings=spent)
 
 

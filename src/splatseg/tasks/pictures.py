@@ -362,7 +362,8 @@ def write_query_report(
             "least probability": answers.options.min_probability,
         },
     )
-    return write_page(page, scene_path(root, REPORTS_FOLDER, "query.html"), answers_record(answers))
+    path = scene_path(root, REPORTS_FOLDER, "query.html")
+    return write_page(page, path, record=answers_record(answers))
 
 
 def _summary(answers: Answers) -> str:

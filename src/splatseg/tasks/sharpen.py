@@ -77,7 +77,7 @@ class SharpenSceneOptions:
     for none."""
 
     seed: int = 0
-    """Seed of the order of views and of random codes."""
+    """Seed of all random choices."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -123,7 +123,7 @@ def report_street(
         )
         page = street_report(data, views=views, above=_above(scans, scene, classes))
         path = scene_path(root, REPORTS_FOLDER, f"{name}.html")
-        return write_page(page, path, street_record(data))
+        return write_page(page, path, record=street_record(data))
 
 
 def _making(made: StreetField | StreetDrive | None, scene: Scene) -> dict[str, Any]:

@@ -397,7 +397,7 @@ def layer_versions() -> dict[str, str]:
     return versions("splatseg") | {"torch": str(torch.__version__)}
 
 
-def write_page(page: Report, path: Path, record: Mapping[str, Any]) -> Path:
+def write_page(page: Report, path: Path, *, record: Mapping[str, Any]) -> Path:
     """Write a page, and the record of what it shows as JSON beside it."""
     with atomic_file(path) as temporary:
         temporary.write_text(report_html(page), encoding="utf-8", newline="\n")

@@ -24,8 +24,8 @@ from splatseg.tasks import (
     save_street_field,
     street_field,
 )
-from splatseg.tasks.street_inputs import DriveSources, drive_sources
-from splatseg.tasks.work import SILENT, Observer, Work, scene_field
+from splatseg.tasks.street_inputs import DriveSources, drive_inputs, drive_sources
+from splatseg.tasks.work import Observer, Work, scene_field
 
 QUICK = DnmpOptions(voxels=(2.0, 4.0), geometry_iterations=1, iterations=3, rays=64)
 EVIDENCE = StreetOptions(evidence="labels_semantic")
@@ -234,7 +234,7 @@ def test_the_only_label_maps_teach(drive, tmp_path) -> None:
     """Depth of scans, which a fit leaves in its scene, is evidence too."""
     (tmp_path / "evidence").mkdir()
     create_evidence(tmp_path / "evidence" / "depth_scans", kind="depth")
-    with drive_inputs(replace(drive, root=tmp_path), StreetOptions(), SILENT) as inputs:
+    with drive_inputs(Work(scene=replace(drive, root=tmp_path)), StreetOptions()) as inputs:
         assert inputs.name == "labels_semantic"
 
 
