@@ -79,10 +79,13 @@ def history(root):
     return json.loads((root / "scene.json").read_text())["provenance"]["edits"]
 
 
-def test_a_thing_is_removed_at_its_masks_and_comes_back(room, tmp_path, capsys) -> None:
+def test_a_thing_is_removed_at_its_masks_and_comes_back(
+    room, tmp_path, capsys, monkeypatch
+) -> None:
+    monkeypatch.setattr("splatseg.lift.boundaries.cut._MIN_WEIGHT", 0)
     out = tmp_path / "out"
     words = ["edit", str(room), "-o", str(out), "--remove", "--layer", "objects"]
-    assert main([*words, "--names", "thing", "--min-weight", "0"]) == 0
+    assert main([*words, "--names", "thing"]) == 0
     said = capsys.readouterr().out
     assert "Gaussians split at the boundary (masks): renders before and after are" in said
     (edit,) = history(out)
@@ -245,8 +248,8 @@ def test_scenes_are_joined(room, tmp_path) -> None:
         (["--merge", "nowhere"], "nowhere: expected a scene folder, got none"),
         (["--merge", "nowhere", "--colour", "1", "0", "0"], "--merge: takes no colours"),
         (
-            ["--remove", "--layer", "objects", "--ids", "3", "--parts", "7"],
-            "parts: expected one of",
+            ["--remove", "--layer", "objects", "--ids", "3", "--min-side", "0.7"],
+            "--min-side: expected a value in [0, 0.5], got 0.7",
         ),
         (
             [

@@ -168,7 +168,7 @@ def test_json_of_the_main_job(small, splatseg, tmp_path) -> None:
     assert Path(exported["table"]).is_file()
     figures = one_object(splatseg("evaluate", scene, *cpu, "--json"))
     assert figures["PSNR"] > 30
-    quick = ("--sharpen-steps", 4, "--decide-every", 2, "--rates-from", 0)
+    quick = ("--sharpen-steps", 4)
     sharp = one_object(
         splatseg("sharpen", scene, "-o", tmp_path / "s", "--layer", "classes", *quick, "--json")
     )

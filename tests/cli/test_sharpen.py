@@ -21,7 +21,14 @@ from splatseg.io.images import save_png
 from splatseg.io.scene import load_scene, load_scene_layer, save_scene_layer
 from splatseg.render import render
 
-QUICK = ("--sharpen-steps", 60, "--decide-every", 30, "--rates-from", 0, "--no-correct-confusion")
+QUICK = ("--sharpen-steps", 60, "--no-correct-confusion")
+
+
+@pytest.fixture(autouse=True)
+def rates_of_a_fit_that_begins(monkeypatch) -> None:
+    """Few steps move much."""
+    monkeypatch.setattr("splatseg.lift.boundaries.sharpen._RATES_FROM", 0.0)
+    monkeypatch.setattr("splatseg.lift.boundaries.sharpen.DECIDE_EVERY", 30)
 
 
 @pytest.fixture

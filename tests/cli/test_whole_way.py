@@ -123,7 +123,7 @@ def test_masks_of_a_model_become_instances(room, run) -> None:
 
 
 def test_sharpened_gaussians_agree_more_with_their_labels(room, run, classes, tmp_path) -> None:
-    quick = ("--sharpen-steps", 40, "--decide-every", 20, "--rates-from", 0)
+    quick = ("--sharpen-steps", 40)
     plain = (*quick, "--no-correct-confusion", *CPU)
     run("sharpen", room, "-o", tmp_path / "sharp", "--layer", classes, *plain)
     first, last = load_scene(tmp_path / "sharp").provenance["sharpened"]["agreement"]

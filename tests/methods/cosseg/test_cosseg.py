@@ -197,8 +197,8 @@ def interrupted(halves, encoder_file, folder, **setting):
     """The layer of a training that was interrupted and went on, and the context it went on with."""
     path = folder / "training.npz"
 
-    def stop(state) -> None:
-        if state.step == 11:
+    def stop(done: int, _: int) -> None:
+        if done == 11:
             raise KeyboardInterrupt
 
     stopped = context(checkpoints=Checkpoints(path=path), progress=stop)

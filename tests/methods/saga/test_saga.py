@@ -1,6 +1,5 @@
 """Training of affinity features: what is found, what options do, and that bits repeat."""
 
-import threading
 from dataclasses import replace
 
 import numpy as np
@@ -198,14 +197,13 @@ def test_the_order_of_views_does_not_matter(walls, plain) -> None:
 @pytest.mark.bits
 def test_what_was_interrupted_goes_on_to_the_same_bits(walls, plain, tmp_path) -> None:
     path = tmp_path / "saga.npz"
-    stop = threading.Event()
 
-    def tell(progress) -> None:
-        if progress.step == 25:
-            stop.set()
+    def tell(done: int, _: int) -> None:
+        if done == 25:
+            raise KeyboardInterrupt
 
     options = SagaOptions(**QUICK)
-    first = context(checkpoints=Checkpoints(path=path), progress=tell, cancelled=stop.is_set)
+    first = context(checkpoints=Checkpoints(path=path), progress=tell)
     with pytest.raises(KeyboardInterrupt):
         train_saga(walls.gaussians, walls.views, walls.evidence, options=options, context=first)
     again = context(checkpoints=Checkpoints(path=path, resume=True))
@@ -240,14 +238,14 @@ def test_the_published_setting_resumes_to_the_same_bits(walls, tmp_path) -> None
     finally:
         _native.set_threads(threads[0])
         torch.set_num_threads(threads[1])
-    stop, path = threading.Event(), tmp_path / "saga.npz"
+    path = tmp_path / "saga.npz"
 
-    def tell(progress) -> None:
-        if progress.step == 7:
-            stop.set()
+    def tell(done: int, _: int) -> None:
+        if done == 7:
+            raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        made(checkpoints=Checkpoints(path=path), progress=tell, cancelled=stop.is_set)
+        made(checkpoints=Checkpoints(path=path), progress=tell)
     assert torch.equal(made(checkpoints=Checkpoints(path=path, resume=True)), whole)
 
 
