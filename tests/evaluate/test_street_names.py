@@ -3,8 +3,6 @@
 import pytest
 
 from splatseg.evaluate import street_class
-from splatseg.evaluate.protocols import TABLE_1, street_class
-from splatseg.io.benchmarks.kitti360 import EVALUATED
 from splatseg.io.captures.waymo import CAMERA_CLASSES, LIDAR_CLASSES
 from splatseg.io.label_tables import label_table
 from splatseg_bench.layouts.kitti360 import EVALUATED

@@ -12,18 +12,6 @@ from splatseg.core.json_values import plain_object
 from splatseg.errors import InputError
 from splatseg.io.atomic import path_inside
 from splatseg.io.captures.pose_tables import TRAIN_EVERY
-from splatseg.evaluate.protocols import (
-    MapSwitches,
-    PointSwitches,
-    Protocol,
-    RoomSwitches,
-    StreetSwitches,
-    TargetSwitches,
-)
-from splatseg.io.benchmarks.replica import LAYOUT as REPLICA
-from splatseg.io.benchmarks.replica import SEQUENCES
-from splatseg.io.captures.pose_tables import TRAIN_EVERY
-from splatseg.io.paths import path_inside
 from splatseg.io.scans import scan_formats
 from splatseg.io.scene import load_scene
 from splatseg.io.scene_folder import CHECKPOINT_FILE, is_scene

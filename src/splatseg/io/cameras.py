@@ -24,9 +24,6 @@ from splatseg.io.captures.nerfstudio import (
     frames_of,
     lens_of,
 )
-from splatseg.core.view_names import view_name_fault
-from splatseg.errors import FileFormatError
-from splatseg.io.captures.nerfstudio import LENS_KEYS, Frame, frame_matrix, frames_of, lens_of
 from splatseg.io.captures.raw_views import checked_pose, opencv_from_opengl
 from splatseg.io.foreign import made_from
 from splatseg.io.schema import malformed

@@ -12,10 +12,6 @@ from splatseg.errors import InputError
 from splatseg.io.arrays import npz_names, read_npy, read_npz
 from splatseg.io.foreign import reading
 from splatseg.io.images import open_image
-from splatseg.io.foreign import reading
-from splatseg.io.images import open_image
-from splatseg.io.npy import read_npy
-from splatseg.io.npz import npz_names, read_npz
 from splatseg.io.schema import expect
 
 DEPTH_NAME = "depth"

@@ -11,7 +11,6 @@ from splatseg.core.json_values import plain_json
 from splatseg.errors import FileFormatError, InputError, quoted, reason
 from splatseg.io.atomic import atomic_file
 from splatseg.io.foreign import expect, read_bytes, reading
-from splatseg.io.foreign import read_bytes, reading
 
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]|[\ud800-\udfff]")
 _LONE = re.compile("[\ud800-\udfff]")

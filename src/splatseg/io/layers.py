@@ -36,8 +36,6 @@ from splatseg.core.boundary import boundary
 from splatseg.core.json_values import MAX_NUMBER
 from splatseg.errors import FileFormatError, InputError, reason
 from splatseg.io.arrays import HEADER, open_npz, save_arrays
-from splatseg.core.json_values import json_integer, json_number
-from splatseg.errors import FileFormatError, InputError, quoted, reason
 from splatseg.io.atomic import atomic_file
 from splatseg.io.foreign import expect, made_from
 from splatseg.io.json_files import check_version, parse_object

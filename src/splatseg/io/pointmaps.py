@@ -27,13 +27,6 @@ from splatseg.io.atomic import atomic_file, named_write_failures
 from splatseg.io.foreign import made_from
 from splatseg.io.json_files import write_json
 from splatseg.io.schema import check_array, expect, read_structured
-from splatseg.io.atomic import atomic_file
-from splatseg.io.foreign import made_from
-from splatseg.io.json_files import write_json
-from splatseg.io.npz import read_npz
-from splatseg.io.npz_writing import save_arrays
-from splatseg.io.schema import check_array, expect, read_structured
-from splatseg.io.write_errors import named_write_failures
 
 FORMAT = "splatseg-pointmaps"
 VERSION = 1

@@ -41,9 +41,6 @@ from splatseg.io.atomic import (
     sync,
     sync_tree,
 )
-from splatseg.core.json_values import json_integer, json_number
-from splatseg.errors import FileFormatError, InputError, MissingFileError, quoted
-from splatseg.io.atomic import atomic_folder, hidden_folder, is_vacant, sync, sync_tree
 from splatseg.io.cameras import (
     cameras_content,
     relative_path,

@@ -14,7 +14,6 @@ import torch
 from msgspec import Meta
 from torch import Tensor
 
-from splatseg.core.json_values import json_integer
 from splatseg.errors import FileFormatError, InputError, MissingFileError, quoted
 from splatseg.io.arrays import open_npz
 from splatseg.io.atomic import atomic_file

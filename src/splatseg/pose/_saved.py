@@ -20,8 +20,7 @@ from splatseg.errors import FileFormatError
 from splatseg.io.arrays import HEADER, read_npz, save_arrays
 from splatseg.io.atomic import atomic_file, named_write_failures
 from splatseg.io.captures.build import build_capture
-from splatseg.io.captures.colmap_model import read_colmap_model
-from splatseg.io.captures.colmap_model import intrinsics_of, poses_of
+from splatseg.io.captures.colmap_model import intrinsics_of, poses_of, read_colmap_model
 from splatseg.io.captures.raw_views import Intrinsics, RawView
 from splatseg.io.foreign import made_from
 from splatseg.io.json_files import parse_object, read_json, write_json

@@ -19,7 +19,6 @@ from splatseg.core.json_values import json_integer, json_number
 from splatseg.core.options import removed_options
 from splatseg.errors import FileFormatError, MissingFileError, quoted, visible
 from splatseg.io.atomic import named_write_failures, path_inside
-from splatseg.errors import FileFormatError, quoted
 from splatseg.io.foreign import made_from
 from splatseg.io.json_files import json_text, parse_object, read_json, write_json
 from splatseg.io.scene import DRIVE_FILE

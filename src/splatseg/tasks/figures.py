@@ -11,8 +11,6 @@ import torch
 from torch import Tensor
 
 from splatseg.errors import FileFormatError, InputError
-from splatseg.core.json_values import id_of_key, json_number
-from splatseg.errors import FileFormatError, quoted
 from splatseg.evaluate import (
     BinaryReport,
     Confusion,

@@ -34,10 +34,6 @@ from splatseg_bench.options import BenchOptions
 from splatseg_bench.protocols import find_protocol
 from splatseg_bench.run import BenchRun, bench
 from splatseg_bench.scene import Scribble, TargetTask, TrueMask
-from splatseg.tasks.benchmark import BenchOptions, BenchRun, bench
-from splatseg.tasks.benchmark.chosen import BySelection
-from splatseg.tasks.benchmark.prompts import stroke_prompt
-from splatseg.tasks.sources import OpenedSource, SourceRequest, open_source
 from support.red_square import NAMES, SIZE, camera, save_strokes, wall
 
 SQUARE, WALL, ALL = 2, 3, 1

@@ -31,11 +31,6 @@ from splatseg_bench.layouts.scannetpp import find_scannetpp_scenes, read_scannet
 from splatseg_bench.layouts.spin_nerf import find_spin_nerf, read_spin_nerf
 from splatseg_bench.layouts.waymo import find_waymo_scenes, read_waymo_scenes
 from splatseg_bench.scene import BenchmarkScene
-from splatseg.io.benchmarks.scannet import find_scannet_scenes, read_scannet_scenes
-from splatseg.io.benchmarks.scannetpp import find_scannetpp_scenes, read_scannetpp_scenes
-from splatseg.io.benchmarks.spin_nerf import find_spin_nerf, read_spin_nerf
-from splatseg.io.benchmarks.waymo import find_waymo_scenes, read_waymo_scenes
-from splatseg.io.captures.kitti360 import window_of
 
 
 @dataclass(frozen=True, slots=True)

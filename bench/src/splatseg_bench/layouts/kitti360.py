@@ -18,8 +18,6 @@ from torch import Tensor
 
 from splatseg.core import UNLABELLED, Capture, ClassTable, LabelMap, Labels, View
 from splatseg.errors import FileFormatError, InputError, MissingFileError, quoted
-from splatseg.io.benchmarks._masks import check_proportions, true_ids
-from splatseg.io.benchmarks._views import read_views
 from splatseg.io.captures.kitti360 import (
     ACCUMULATED,
     PHOTOGRAPHS,

@@ -16,7 +16,6 @@ from jaxtyping import Bool
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splatseg.core import BenchmarkScene, TargetTask, TrueMask
 from splatseg.core.json_values import json_integer, json_number
 from splatseg.errors import FileFormatError, MissingFileError, quoted
 from splatseg.io.captures import find_formats

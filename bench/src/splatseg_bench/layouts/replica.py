@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, cast
 
 from splatseg.core import Capture, ClassInfo, ClassTable, View
-from splatseg.core import BenchmarkScene, Capture, ClassInfo, ClassTable, TrueMaps, View
 from splatseg.core.json_values import json_integer
 from splatseg.errors import FileFormatError, InputError, MissingFileError, quoted
 from splatseg.io.captures import find_formats

@@ -11,8 +11,6 @@ import torch
 
 from splatseg.core import UNLABELLED, ClassInfo, ClassTable, LabelMap, Labels, View
 from splatseg.errors import FileFormatError, MissingFileError, quoted
-from splatseg.io.benchmarks._masks import true_ids
-from splatseg.io.benchmarks._views import read_views, scene_folders, trained_on_all
 from splatseg.io.captures.pose_tables import find_scannet, labelled_mesh
 from splatseg.io.foreign import is_file, read_lines
 from splatseg.io.ply import read_ply_vertices, vertex_positions

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from splatseg.core import UNLABELLED, ClassInfo, ClassTable, Labels
 from splatseg.errors import FileFormatError, MissingFileError, quoted
-from splatseg.io.benchmarks._views import read_views, scene_folders
 from splatseg.io.captures.nerfstudio import find_scannetpp
 from splatseg.io.foreign import made_from, reading
 from splatseg.io.json_files import read_json

@@ -15,7 +15,6 @@ from PIL import Image
 
 from splatseg.core import UNLABELLED, LabelMap, Labels, View
 from splatseg.errors import FileFormatError, MissingFileError
-from splatseg.io.benchmarks._masks import check_proportions
 from splatseg.io.captures.waymo import (
     CAMERA,
     CAMERA_CLASSES,

@@ -29,7 +29,6 @@ from splatseg.io.evidence._masks import RunLengths
 from splatseg.io.foreign import is_folder, made_from, reading
 from splatseg.io.images import open_image
 from splatseg.io.limits import check_unpacked
-from splatseg.io.paths import path_inside
 from splatseg.io.schema import Name, Side, Whole, expect, malformed, structured
 
 _FOLDERS = ("panoptic", "panoptic_seg", ".")

@@ -25,7 +25,6 @@ from splatseg.io.captures.raw_views import (
 )
 from splatseg.io.foreign import is_file, is_folder, made_from
 from splatseg.io.images import DEFAULT_LONGEST, IMAGE_SUFFIXES, image_size, reduced_size, same_shape
-from splatseg.io.paths import check_utf8
 
 TEST_EVERY = 8
 """Without a split of its own, views 0, 8, 16 ... of a capture by sorted name are test views."""

@@ -27,7 +27,6 @@ from splatseg.io.captures.raw_views import Intrinsics, RawView, checked_pose, in
 from splatseg.io.foreign import is_folder
 from splatseg.io.images import find_images
 from splatseg.io.ply import read_ply_vertices, vertex_positions
-from splatseg.io.ply_vertices import read_ply_vertices, vertex_positions
 from splatseg.io.schema import expect, malformed
 from splatseg.io.text_numbers import (
     keyed_matrix,

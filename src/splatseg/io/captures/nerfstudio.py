@@ -24,7 +24,6 @@ from splatseg.io.captures.raw_views import Intrinsics, OfSize, RawView, opencv_f
 from splatseg.io.foreign import is_file
 from splatseg.io.json_files import read_json
 from splatseg.io.ply import ply_columns
-from splatseg.io.ply_vertices import ply_columns
 from splatseg.io.schema import MAX_SIDE, Name, expect, malformed, read_structured, structured
 
 FILE = "transforms.json"

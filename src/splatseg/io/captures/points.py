@@ -16,9 +16,6 @@ from splatseg.errors import InputError
 from splatseg.io.json_files import read_json
 from splatseg.io.ply import read_ply_vertices
 from splatseg.io.tables import class_table
-from splatseg.io.class_tables import class_table
-from splatseg.io.json_files import read_json
-from splatseg.io.ply_vertices import read_ply_vertices
 
 _COLOURS = (
     ("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"),

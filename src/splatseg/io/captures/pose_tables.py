@@ -20,9 +20,6 @@ from splatseg.io.captures.raw_views import Intrinsics, RawView, inverse_pose
 from splatseg.io.foreign import is_file
 from splatseg.io.images import find_images, image_size
 from splatseg.io.ply import read_ply_vertices, vertex_positions
-from splatseg.io.npy import read_npy
-from splatseg.io.npz import open_npz
-from splatseg.io.ply_vertices import read_ply_vertices, vertex_positions
 from splatseg.io.schema import MAX_SIDE, check_array, expect, read_structured
 from splatseg.io.text_numbers import read_numbers
 

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from splatseg.core import Capture, ClassInfo, ClassTable
 from splatseg.errors import InputError, MissingFileError, SplatsegError
 from splatseg.io.atomic import atomic_folder, path_inside, sweep
-from splatseg.io.atomic import atomic_folder, sweep
 from splatseg.io.captures.build import build_capture
 from splatseg.io.captures.raw_views import Intrinsics, RawView, checked_pose, inverse_pose
 from splatseg.io.captures.waymo_tfrecord import (
@@ -34,7 +33,6 @@ from splatseg.io.captures.waymo_tfrecord import (
 from splatseg.io.foreign import is_file
 from splatseg.io.json_files import read_json, write_json
 from splatseg.io.parquet import Row, RowReader, bytes_of, integer_of, list_of, number_of, read_rows
-from splatseg.io.paths import path_inside
 from splatseg.io.schema import MAX_SIDE, expect
 
 IMAGES = "camera_image"

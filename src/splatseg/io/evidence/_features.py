@@ -26,9 +26,6 @@ from splatseg.errors import InputError
 from splatseg.io.arrays import read_npz
 from splatseg.io.depths import depth_kind, read_depth_map
 from splatseg.io.evidence._base import EvidenceKind, FileEvidence
-from splatseg.io.depths import depth_kind, read_depth_map
-from splatseg.io.evidence._base import EvidenceKind, FileEvidence
-from splatseg.io.npz import read_npz
 from splatseg.io.schema import check_array, expect
 
 QUANTISATION_FILE = "quant.npz"

@@ -29,8 +29,6 @@ from splatseg.io.evidence._base import (
 from splatseg.io.foreign import reading
 from splatseg.io.images import left_out_pixels, open_image
 from splatseg.io.limits import check_unpacked
-from splatseg.io.npy import read_npy
-from splatseg.io.npz import npz_names, read_npz
 from splatseg.io.schema import expect, malformed
 
 SOFT_NAMES = ("probabilities", "logits")

@@ -24,8 +24,6 @@ from splatseg.io.evidence._labels import read_id_map
 from splatseg.io.foreign import made_from
 from splatseg.io.json_files import read_json_value
 from splatseg.io.limits import check_unpacked
-from splatseg.io.npy import read_npy
-from splatseg.io.npz import npz_names, read_npz
 from splatseg.io.schema import Side, check_array, expect, malformed, structured
 
 MASK_TABLE = "metadata.csv"

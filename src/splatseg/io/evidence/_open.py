@@ -12,8 +12,6 @@ from splatseg.core.json_values import id_of_key
 from splatseg.errors import InputError, MissingFileError, RangeError
 from splatseg.io.arrays import npz_names
 from splatseg.io.captures import read_metadata
-from splatseg.io.captures import read_metadata
-from splatseg.io.class_tables import class_table
 from splatseg.io.depths import DEPTH_NAME
 from splatseg.io.evidence._base import (
     HEADER_FILE,
@@ -36,8 +34,6 @@ from splatseg.io.json_files import read_json, read_json_value
 from splatseg.io.label_tables import LabelTable, label_table, training_table
 from splatseg.io.schema import expect, structured
 from splatseg.io.tables import class_table
-from splatseg.io.npz import npz_names
-from splatseg.io.schema import expect, structured
 
 FORMAT = "splatseg-evidence"
 VERSION = 2

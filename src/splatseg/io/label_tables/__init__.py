@@ -19,11 +19,6 @@ from splatseg.io.foreign import read_lines
 from splatseg.io.json_files import read_json
 from splatseg.io.schema import malformed
 from splatseg.io.tables import class_table
-from splatseg.errors import InputError
-from splatseg.io.class_tables import class_table
-from splatseg.io.foreign import read_lines
-from splatseg.io.json_files import read_json
-from splatseg.io.schema import malformed
 
 TABLES = ("ade20k", "coco", "cityscapes", "scannet", "kitti360", "semantic-kitti", "voc")
 """Data sets whose tables are known by name."""

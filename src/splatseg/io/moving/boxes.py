@@ -34,8 +34,6 @@ from splatseg.core.boundary import boundary
 from splatseg.core.json_values import MAX_NUMBER
 from splatseg.core.rigid import quaternion_from_rotation
 from splatseg.core.scans import MovingBox
-from splatseg.core.moving import MovingBox
-from splatseg.core.rigid import quaternion_from_rotation
 from splatseg.errors import MissingFileError
 from splatseg.io.captures.kitti360 import SCANS, VELODYNE, Drive, find_drive
 from splatseg.io.captures.waymo import (

@@ -18,18 +18,12 @@ from splatseg.core.scans import MovingBox, boxes_at, inside_boxes, pixels_of_box
 from splatseg.core.scene import camera_of_map, frame_number
 from splatseg.errors import FileFormatError, InputError
 from splatseg.io.atomic import path_inside
-from splatseg.core.moving import MovingBox, boxes_at, inside_boxes, pixels_of_boxes
-from splatseg.core.options import Natural, NonNegative, options
-from splatseg.core.scene import camera_of_map
-from splatseg.core.view_names import frame_number
-from splatseg.errors import FileFormatError, InputError
 from splatseg.io.captures.kitti360 import SCANS, VELODYNE, find_drive
 from splatseg.io.captures.nerfstudio import FILE
 from splatseg.io.captures.waymo import MICROSECOND
 from splatseg.io.evidence import Evidence
 from splatseg.io.images import load_mask, save_png
 from splatseg.io.json_files import read_json
-from splatseg.io.paths import path_inside
 from splatseg.io.schema import structured
 from splatseg.io.text_numbers import frame_time, read_times
 

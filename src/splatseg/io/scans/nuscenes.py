@@ -25,10 +25,6 @@ from splatseg.io.atomic import path_inside
 from splatseg.io.captures.raw_views import checked_pose, pose_of_quaternion
 from splatseg.io.foreign import is_file
 from splatseg.io.json_files import read_json_rows
-from splatseg.io.captures.raw_views import checked_pose, pose_of_quaternion
-from splatseg.io.foreign import is_file
-from splatseg.io.json_files import read_json_rows
-from splatseg.io.paths import path_inside
 from splatseg.io.scans._source import (
     RawScan,
     Scans,

@@ -37,9 +37,6 @@ from splatseg.errors import (
     quoted,
 )
 from splatseg.io.arrays import open_npz, write_checkpoint_file
-from splatseg.core.json_values import json_integer, json_number
-from splatseg.core.recorded_options import DIFFERENCES, differing_names, option_differences
-from splatseg.errors import FileFormatError, InputError, brief, quoted
 from splatseg.io.json_files import parse_object
 from splatseg.io.schema import structured
 

@@ -11,8 +11,6 @@ from PIL import Image
 from splatseg.io.captures import read_capture
 from splatseg.io.captures.colmap import read_colmap_model
 from splatseg.pose._doctor_files import read_for_doctor
-from splatseg.io.captures.colmap_model import read_colmap_model
-from splatseg.pose.doctor._files import read_for_doctor
 from support.fuzz.targets.base import (
     GOLDEN,
     HEIGHT,
