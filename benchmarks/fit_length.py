@@ -8,7 +8,7 @@ CAPTURE has true maps in `semantic` and `instance`, and machine labels in `label
 all held-out views and of those that `segment` looks at, mIoU of classes from `labels_semantic`
 (`uplift`), of instances from true maps (`uplift`: what the geometry allows) and, with `--masks`,
 from masks (`associate`). All on held-out views. `--generate` writes a room to begin with. The
-thresholds of `splatseg.tasks.segment_inputs` come from here (decision 0025).
+thresholds of `splatseg.tasks.segment_inputs` come from here (docs/decisions/fitting.md).
 """
 
 import argparse

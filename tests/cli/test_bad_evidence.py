@@ -201,7 +201,10 @@ def test_ids_beyond_what_files_hold(splatseg, small, labels) -> None:
     [
         ({"kind": "banana"}, "expected evidence"),
         ({"version": 9}, "version 2 or less, got version 9"),
-        ({"classes": [{"id": 2**40, "name": "x"}]}, "classes[0]: expected an id up to 2147483647"),
+        (
+            {"classes": [{"id": 2**40, "name": "x"}]},
+            "classes[0].id: expected a whole number of at most 2147483647",
+        ),
         ({"source_ids": {"9": 3}}, "source_ids of all ids, got none of the id 1"),
         ({"source_ids": {"1": "x"}}, "source_ids[1]: expected a whole number, got 'x'"),
         ({"metadata": {"complete": False}}, "got 3 of work that was stopped"),

@@ -21,7 +21,7 @@ MAKE = {
     "see", "segment", "select", "sharpen", "street",
 }  # fmt: skip
 TELL = {"doctor", "info"}
-OWN_HELP = {"frames": ["fit"], "seed": ["attach", "demo"]}
+OWN_HELP = {"frames": ["fit"], "seed": ["demo"]}
 
 
 def help_of(page: str, flag: str) -> str | None:
@@ -41,17 +41,6 @@ def test_what_makes_something_prints_json_and_can_be_quiet(name) -> None:
     page = (FOLDER / f"{name}.txt").read_text(encoding="utf-8")
     assert (help_of(page, "json") is not None) == (name in MAKE | TELL)
     assert (help_of(page, "quiet") is not None) == (name in MAKE)
-
-
-@pytest.mark.parametrize("name", COMMANDS)
-def test_shared_flags_have_the_shared_type(name) -> None:
-    declared = annotations(name)
-    for field, kind in SHARED.items():
-        if field in declared and (name, field) not in OWN:
-            assert declared[field] == kind, f"{name}: {field}"
-            assert hasattr(_types, kind)
-    assert declared.get("data", "Data") == "Data" or name in {"doctor", "fit", "import"}
-    assert declared.get("split", "Split") in {"Split", "SplitOrPath"}
 
 
 @pytest.mark.parametrize(

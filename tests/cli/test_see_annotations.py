@@ -112,7 +112,7 @@ def test_colours_with_their_table(small, splatseg, tmp_path) -> None:
     status, out, err = see(small, splatseg, folder)
     assert status == 0, err
     assert out.startswith("labels of 3 views by task")
-    assert "1 of 4 annotated pictures are of no view ('elsewhere')" in err
+    assert "1 of 4 annotated pictures are of no view ('elsewhere.png')" in err
     evidence = open_evidence(small.scene / "evidence" / "e")
     assert evidence.classes is not None
     assert {row.id: row.name for row in evidence.classes.rows} == {1: "chair", 2: "floor"}

@@ -335,7 +335,7 @@ def test_masks_are_refused_after_things_moved(document) -> None:
         ),
         ({"kind": "remove", "where": {"layer": "a"}, "specks": -1}, RangeError, "0 or more"),
         ({"kind": "extract", "where": {"layer": "a"}, "specks": 9}, InputError, "takes no specks"),
-        ({"kind": "remove", "where": 3}, InputError, "where: expected object .*, got 3"),
+        ({"kind": "remove", "where": 3}, InputError, "where: expected an object or null, got 3"),
         ({"kind": "remove", "why": 3}, InputError, "expected the keys of an edit, got 'why'"),
         (
             {"kind": "transform", "transform": {"rotation": [[1, 0, 0]], "translation": [0, 0, 0]}},
@@ -350,8 +350,8 @@ def test_masks_are_refused_after_things_moved(document) -> None:
                     "translation": [0, math.nan, 0],
                 },
             },
-            RangeError,
-            "translation: 1 of 3 values are not finite",
+            InputError,
+            r"translation\[1\]: expected a finite number up to 1e\+30, got nan",
         ),
         (
             {
@@ -382,7 +382,7 @@ def test_masks_are_refused_after_things_moved(document) -> None:
                 "cut": {"by": "box", "options": {"min_side": True}},
             },
             InputError,
-            "expected a number as min_side, got True",
+            "min_side: expected a number, got True",
         ),
     ],
 )

@@ -103,7 +103,7 @@ def desk_and_mouse(*, evidence=20.0) -> Labels:
 
 
 def test_defaults_are_those_that_the_figures_were_measured_with() -> None:
-    """Decision 0013; other numbers need other figures."""
+    """docs/decisions/voting.md; other numbers need other figures."""
     assert asdict(ConfusionOptions()) == {
         "effective_views": 10.0,
         "max_correlation": 1.0,

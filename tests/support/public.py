@@ -22,7 +22,6 @@ PACKAGES = (
     "lift.training",
     "methods",
     "models",
-    "models.classical",
     "neighbours",
     "raycast",
     "pose",

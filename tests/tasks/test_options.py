@@ -128,7 +128,7 @@ def test_sharpening_measures_and_records(made, tmp_path) -> None:
         load_document(made),
         tmp_path / "new",
         options=SharpenSceneOptions(layer="classes", measure=1, seed=7),
-        sharpen_options=SharpenOptions(sharpen_steps=4, decide_every=2, rates_from=0),
+        sharpen_options=SharpenOptions(sharpen_steps=4),
         backend="cpu",
     )
     assert done.measured_views == 1

@@ -74,7 +74,7 @@ def test_cells_and_units_count(small_room, walls, tmp_path, monkeypatch) -> None
     given = replace(read_capture(small_room), points=None)
     counts = []
     for cell in (0.12, 0.6):
-        monkeypatch.setattr("splatseg.tasks._scan_depth._START_CELL", cell)
+        monkeypatch.setattr("splatseg.tasks.photographs._START_CELL", cell)
         found = with_scans(given, Scans({"0": walls}), scene=tmp_path, report=lambda _: None)
         assert found.points is not None
         counts.append(len(found.points))

@@ -9,7 +9,6 @@ import torch
 
 from splatseg.core import Features, InstanceFacts, Labels, LayerInfo, Scene, Selection, View
 from splatseg.errors import InputError, ShapeError
-from splatseg.methods.prompt.options import PromptOptions
 from splatseg.prompting import pipeline
 from splatseg.prompting.prompts import AxisBox, Ball, Lasso, Similar, ViewPrompt
 from splatseg.tasks import SelectOptions, open_selector, select
@@ -187,8 +186,8 @@ def test_each_step_follows_unless_none_is_to(world, step, monkeypatch) -> None:
 
 
 def test_the_seed_reaches_the_prompts(world, monkeypatch) -> None:
-    few = partial(PromptOptions, max_pixels=40)
-    monkeypatch.setattr(importlib.import_module("splatseg.tasks.select"), "PromptOptions", few)
+    module = importlib.import_module("splatseg.tasks.select")
+    monkeypatch.setattr(module, "see_prompts", partial(module.see_prompts, max_pixels=40))
     mask = torch.zeros(30, 40, dtype=torch.bool)
     mask[11:29, 2:18] = True
     prompt = ViewPrompt(view=world.scene.views[0], mask=mask)
@@ -221,9 +220,8 @@ def test_a_session_opens_its_source_once_and_keeps_nothing_else(world) -> None:
 
 def test_who_advises_is_asked_with_the_final_confidence(world, monkeypatch) -> None:
     heard = []
-    monkeypatch.setattr(
-        "splatseg.tasks.select.next_click", lambda c, context: heard.append((c, context))
-    )
+    module = importlib.import_module("splatseg.tasks.select")
+    monkeypatch.setattr(module, "next_click", lambda c, context: heard.append((c, context)))
     made = world.select(world.click(IN_1), advise=True)
     ((confidence, context),) = heard
     assert torch.equal(confidence, made.selection.confidence)

@@ -143,7 +143,7 @@ def _converter(annotation: Any) -> Converter | None:
         return _SCALARS[annotation]
     origin, args = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is Annotated:
-        return _within(_converter(args[0]), [m for m in args[1:] if isinstance(m, Meta)])
+        return _within(_converter(args[0]), [m for m in args[1:] if _is_range(m)])
     if origin in (Union, types.UnionType):
         return _one_of(args)
     if origin is Literal:
@@ -247,6 +247,11 @@ def _one_of(members: tuple[Any, ...]) -> Converter | None:
         raise InputError(f"{name}: expected {words}, got {describe(value)}.") from errors[0]
 
     return convert
+
+
+def _is_range(note: Any) -> bool:
+    bounds = ("ge", "gt", "le", "lt")
+    return isinstance(note, Meta) and any(getattr(note, name) is not None for name in bounds)
 
 
 def _within(convert: Converter | None, ranges: list[Meta]) -> Converter | None:

@@ -360,7 +360,7 @@ def sensible_steps(train_views: int) -> int:
     """Steps below which a fit of so many training views is too short to be judged.
 
     Twenty a view, and at least 1000: until then growth and resolution have hardly begun, and a
-    fit of twice the length is better by decibels (decision 0025).
+    fit of twice the length is better by decibels (docs/decisions/fitting.md).
 
     Example:
         >>> sensible_steps(48), sensible_steps(300)

@@ -189,7 +189,10 @@ def _finite(kind: Any) -> _Check | None:
         free = any(m.extra and m.extra.get("infinite") for m in args[1:] if hasattr(m, "extra"))
         return None if free else _finite(args[0])
     if origin in (Union, types.UnionType):
-        members = [(typing.get_origin(m) or m, _finite(m)) for m in map(_plain_type, args)]
+        kinds = [_plain_type(m) for m in args]
+        members = [
+            (typing.get_origin(k) or k, _finite(m)) for k, m in zip(kinds, args, strict=True)
+        ]
         known = [(cls, check) for cls, check in members if check is not None]
         return functools.partial(_check_union, known) if known else None
     if origin in (list, tuple, dict):

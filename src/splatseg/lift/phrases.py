@@ -40,7 +40,7 @@ from splatseg.lift.words import TEMPERATURE, WordAnswers
 Relation = Literal["on", "near"]
 
 _NAME, _COLOUR, _RELATION = 1.0, 3.0, 2.0
-"""Alpha, beta and gamma: docs/decisions/0050-phrases.md."""
+"""Alpha, beta and gamma: docs/decisions/words.md."""
 
 _DISTANCE = 20.0
 """Delta E that is clearly another colour."""

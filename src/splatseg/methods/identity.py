@@ -15,7 +15,7 @@ is rendered like colour and what is seen is classified
 are classified and their probabilities rendered
 (:math:`\ell_p = -\log \sum_i w_{pi} q_{i, \mathrm{id}(p)}` over the pixel's weights). Rendered
 logits are unbounded, so that labels which contradict each other are learnt by heart in different
-views; rendered probabilities settle for their majority. Decision 0018.
+views; rendered probabilities settle for their majority. docs/decisions/features.md.
 
 Gaussian Grouping trains geometry, colour and identity together on whole pictures; here geometry
 is frozen, so that rows of W never change, and training runs on rows of sampled pixels

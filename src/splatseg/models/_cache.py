@@ -26,6 +26,7 @@ from splatseg.core.models import DeepFeatures, Embedding, Image, Model, Panoptic
 from splatseg.errors import InputError, reason
 from splatseg.io.arrays import open_npz
 from splatseg.io.atomic import atomic_file
+from splatseg.io.foreign import is_file
 from splatseg.io.json_files import json_text, parse_object
 from splatseg.models._images import image_digest
 
@@ -83,7 +84,7 @@ class ModelCache:
 
     def __post_init__(self) -> None:
         convert_fields(self)
-        if self.folder.exists() and not self.folder.is_dir():
+        if is_file(self.folder):
             raise InputError(f"{self.folder}: expected a folder for the cache, got a file.")
         if not self.folder.absolute().parent.is_dir():
             raise InputError(f"{self.folder}: expected a cache in a folder that is there.")

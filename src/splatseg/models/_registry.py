@@ -50,6 +50,7 @@ def find_family(name: str) -> ModelFamily | None:
     return found if isinstance(found, ModelFamily) else None
 
 
+@boundary
 def model_summary(name: str) -> str | None:
     """The summary of a family, of ours without loading it; None where `find_family` gives None."""
     if name in _ROWS:

@@ -238,7 +238,7 @@ def default_options(
     """The default options of a backend.
 
     The defaults of `RenderOptions`, but for the opacity cap of ``cuda``, which gsplat has built
-    in (``docs/decisions/0006-cuda-opacity-cap.md``).
+    in (``docs/decisions/kernels.md``).
 
     Args:
         name: As for `get_backend`.

@@ -3,9 +3,10 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from msgspec import Meta
 from torch import Tensor
 
 from splatseg.core import (
@@ -19,6 +20,7 @@ from splatseg.core import (
     layer_address,
 )
 from splatseg.core.boundary import boundary
+from splatseg.core.options import MAY_BE_INFINITE
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.selection.components import components
 
@@ -74,6 +76,10 @@ _NUMBERS = ("box", "sphere", "opacity", "size", "colour_near", "component_at")
 _FLAGS = ("largest_component", "invert")
 
 
+Interval = Annotated[tuple[float, float], Meta(extra=MAY_BE_INFINITE)]
+"""A least and a greatest number, the greatest possibly infinite."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Where:
     """A set of Gaussians by description. Of several conditions all must hold.
@@ -101,10 +107,10 @@ class Where:
     sphere: tuple[float, float, float, float] | None = None
     """Centre x, y, z and radius in which centres of Gaussians lie, world, scene units."""
 
-    opacity: tuple[float, float] | None = None
+    opacity: Interval | None = None
     """Least and largest opacity, in [0, 1]."""
 
-    size: tuple[float, float] | None = None
+    size: Interval | None = None
     """Least and largest standard deviation along the longest axis, scene units; may be inf."""
 
     colour_near: tuple[float, float, float, float] | None = None

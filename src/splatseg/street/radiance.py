@@ -47,7 +47,7 @@ _POSITION_SCALE = 20.0
 class RadianceOptions:
     """Sizes of the networks, what a ray is made of, and how training goes.
 
-    The defaults are sized for two cores, about 65 ms of CPU a step (docs/decisions/0045);
+    The defaults are sized for two cores, about 65 ms of CPU a step (docs/decisions/streets.md);
     `PUBLISHED_RADIANCE` are those of the papers.
     """
 

@@ -352,7 +352,7 @@ OPENERS: dict[str, Opener] = {
 
 AUTO: Sequence[Opener] = (_open_tree, _open_features, _open_masks, _open_layer)
 """What ``auto`` tries: what answers best comes first, and what has to be made after what is there;
-labels of classes know no things, and come last (decision 0031)."""
+labels of classes know no things, and come last (docs/decisions/association.md)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -136,7 +136,7 @@ def test_against_the_matrix(halves, division) -> None:
         for view, one in zip(halves.views, rows, strict=True):
             grid = halves.blocks.deep_features(view.name).maps[index].features
             unit = torch.nn.functional.normalize(grid, dim=-1)
-            image = read_grid(unit, cells=(6, 8), size=(24, 32), resampling="bilinear")
+            image = read_grid(unit, cells=(6, 8), size=(24, 32))
             total = total + one.T @ image.reshape(-1, image.shape[-1]).numpy()
         if division == "mean":
             total = total / np.maximum(found.weights.numpy(), 1e-9)[:, None]

@@ -29,7 +29,7 @@ class Reader(Protocol):
         ...
 
 
-class Layout(NamedTuple):
+class _Layout(NamedTuple):
     """How captures of a layout are found and read."""
 
     name: str
@@ -49,21 +49,21 @@ def _has(file: str | Path) -> Callable[[Path], bool]:
 
 
 LAYOUTS = (
-    Layout("nerfstudio", _has(nerfstudio.FILE), nerfstudio.read_nerfstudio, (nerfstudio.FILE,)),
-    Layout(
+    _Layout("nerfstudio", _has(nerfstudio.FILE), nerfstudio.read_nerfstudio, (nerfstudio.FILE,)),
+    _Layout(
         "blender",
         _has(nerfstudio.BLENDER_FILE),
         nerfstudio.read_blender,
         (nerfstudio.BLENDER_FILE,),
     ),
-    Layout("colmap", colmap.find_colmap, colmap.read_colmap),
-    Layout("llff", _has(tables.LLFF_FILE), tables.read_llff, (tables.LLFF_FILE,)),
-    Layout("idr", tables.find_idr, tables.read_idr, tables.IDR_FILES),
-    Layout("replica", tables.find_replica, tables.read_replica, (tables.REPLICA_FILE,)),
-    Layout("scannet", tables.find_scannet, tables.read_scannet),
-    Layout("scannetpp", nerfstudio.find_scannetpp, nerfstudio.read_scannetpp),
-    Layout("kitti360", kitti360.find_kitti360, kitti360.read_kitti360),
-    Layout("waymo", waymo.find_waymo, waymo.read_waymo, suffixes=(waymo.SUFFIX, ENDING)),
+    _Layout("colmap", colmap.find_colmap, colmap.read_colmap),
+    _Layout("llff", _has(tables.LLFF_FILE), tables.read_llff, (tables.LLFF_FILE,)),
+    _Layout("idr", tables.find_idr, tables.read_idr, tables.IDR_FILES),
+    _Layout("replica", tables.find_replica, tables.read_replica, (tables.REPLICA_FILE,)),
+    _Layout("scannet", tables.find_scannet, tables.read_scannet),
+    _Layout("scannetpp", nerfstudio.find_scannetpp, nerfstudio.read_scannetpp),
+    _Layout("kitti360", kitti360.find_kitti360, kitti360.read_kitti360),
+    _Layout("waymo", waymo.find_waymo, waymo.read_waymo, suffixes=(waymo.SUFFIX, ENDING)),
 )
 """Layouts that are read, in the order in which they are looked for."""
 

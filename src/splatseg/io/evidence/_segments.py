@@ -20,6 +20,7 @@ from splatseg.core import (
     View,
     map_ids,
 )
+from splatseg.core.boundary import boundary
 from splatseg.core.json_values import id_of_key
 from splatseg.io.evidence._base import MAX_FILE_ID, Evidence, EvidenceKind
 from splatseg.io.evidence._labels import LabelEvidence, check_size, masks_of_ids
@@ -178,6 +179,7 @@ def open_tables(maps: LabelEvidence, *, tracked: bool) -> TableEvidence:
     return cls(folder=maps.folder, maps=maps, table=read_json(maps.folder / file))
 
 
+@boundary
 def without_masked(evidence: AnyEvidence, views: Iterable[View]) -> AnyEvidence:
     """Label maps without the pixels that masks of views leave out, such as those of moving things.
 

@@ -342,7 +342,7 @@ def run(inputs: MethodInputs, options: AssociateMethodOptions) -> Labels | Insta
 METHOD = Method(
     name="associate",
     summary="segments of all views become instances by the Gaussians they share; no tracker",
-    reference="docs/decisions/0012-association.md",
+    reference="docs/decisions/association.md",
     evidence=("masks", "panoptic", "tracked"),
     options=AssociateMethodOptions,
     run=run,

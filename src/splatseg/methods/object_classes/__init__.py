@@ -20,7 +20,7 @@ disagreement of votes, :math:`\eta`, is between the Gaussians of an object (`het
 
 No publication has this as a whole. Its parts are known: probabilistic linear discriminant analysis,
 and expectation maximization for what the objects of a track are. Features are lifted as those of
-`methods.cosseg` are; the network of that paper is not in it. Decisions 0035 and 0046.
+`methods.cosseg` are; the network of that paper is not in it. docs/decisions/cosseg.md.
 
 References:
     Ioffe, Probabilistic Linear Discriminant Analysis (2006).
@@ -466,7 +466,7 @@ def _kept(
 METHOD = Method(
     name="object-classes",
     summary="labels that contradict each other, decided object by object by votes and likeness",
-    reference="docs/decisions/0046-object-classes.md; PLDA (Ioffe 2006), EM (Dempster et al. 1977)",
+    reference="docs/decisions/cosseg.md; PLDA (Ioffe 2006), EM (Dempster et al. 1977)",
     evidence=("labels", "tracked", "panoptic"),
     options=ObjectLabelOptions,
     run=run,

@@ -14,7 +14,7 @@ squared distance of samples from their means by
 
 and clusters stay two where that exceeds what is allowed. Density alone (HDBSCAN, as the published
 code of SAGA has it) chains objects together through the Gaussians at their borders, whose features
-lie between: `docs/decisions/0032-decomposition.md`.
+lie between: `docs/decisions/features.md`.
 
 References:
     Cen et al., Segment Any 3D Gaussians (2023): automatic decomposition of its published code.
