@@ -14,7 +14,15 @@ imported first, would be a trap.
 Conventions (frames, pixel centres, units, ids): docs/conventions.md.
 """
 
+import os
+import sys
+
 import lazy_loader
+
+if "torch" not in sys.modules:
+    # Idle threads of OpenMP would spin on the cores that the kernels need. It is read when torch
+    # loads; who sets it otherwise keeps that.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 _MOVED = ("bench", "BenchOptions")
 

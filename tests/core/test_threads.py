@@ -6,7 +6,12 @@ import pytest
 import torch
 
 from splatseg.core.boundary import boundary
-from splatseg.core.threads import all_torch_threads, caller_threads, one_torch_thread
+from splatseg.core.threads import (
+    all_torch_threads,
+    caller_threads,
+    network_inference,
+    one_torch_thread,
+)
 
 
 @pytest.fixture(autouse=True)
@@ -51,3 +56,17 @@ def test_networks_have_the_callers_threads() -> None:
     with one_torch_thread():
         assert _network() == (3, 1, 3)
         assert torch.get_num_threads() == 1
+
+
+@boundary
+def _answers() -> tuple[int, bool]:
+    @network_inference()
+    def forward() -> tuple[int, bool]:
+        return torch.get_num_threads(), torch.is_inference_mode_enabled()
+
+    return forward()
+
+
+def test_inference_has_all_threads_and_no_gradients() -> None:
+    assert _answers() == (3, True)
+    assert not torch.is_inference_mode_enabled()

@@ -45,7 +45,9 @@ def imported(package: str) -> ModuleType:
 def public_names(package: str) -> list[str]:
     """What an ``__init__`` re-exports as ``X as X``, or a module defines without underscore."""
     module = imported(package)
-    tree = ast.parse(Path(str(module.__file__)).read_text(encoding="utf-8"))
+    file = Path(str(module.__file__))
+    stub = file.with_suffix(".pyi")  # of packages whose names load at first use
+    tree = ast.parse((stub if stub.is_file() else file).read_text(encoding="utf-8"))
     exported = [
         alias.name
         for node in ast.walk(tree)

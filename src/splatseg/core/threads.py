@@ -4,7 +4,7 @@ The kernels of this library share the cores, and sum in a fixed order. Torch spl
 products of matrices among its threads, so that they round differently with their number; and its
 idle threads spin on the cores that the kernels need. So torch has one thread while a public
 function of this library runs (`core.boundary`), and its caller's again afterwards. Networks of
-others, which are torch alone, run in `all_torch_threads`.
+others, which are torch alone, run in `network_inference`.
 """
 
 import threading
@@ -61,3 +61,10 @@ def all_torch_threads() -> Generator[None]:
     finally:
         torch.set_num_threads(1)
         _limit.outside = before
+
+
+@contextmanager
+def network_inference() -> Generator[None]:
+    """Run a network of others: without gradients, on all threads of torch; also a decorator."""
+    with all_torch_threads(), torch.inference_mode():
+        yield

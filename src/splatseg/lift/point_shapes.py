@@ -33,6 +33,7 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
+from splatseg.core.threads import caller_threads
 from splatseg.neighbours import NeighbourIndex
 
 _STEPS = 4096
@@ -369,7 +370,7 @@ class ShapeForest:
             n_estimators=trees,
             min_samples_leaf=_MIN_LEAF,
             random_state=seed,
-            n_jobs=torch.get_num_threads(),
+            n_jobs=caller_threads(),
         )
         self._forest.fit(
             samples.features.numpy(), labels, sample_weight=samples.weights.numpy() * share[labels]
@@ -382,7 +383,7 @@ class ShapeForest:
         out = torch.zeros(len(features), self._labels)
         columns = torch.from_numpy(np.asarray(self._forest.classes_, dtype=np.int64))
         blocks = features.split(_ROWS)
-        with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+        with ThreadPoolExecutor(caller_threads()) as pool:
             told = pool.map(self._told, blocks)
             for start, shares in zip(range(0, len(out), _ROWS), told, strict=True):
                 out[start : start + _ROWS, columns] = torch.from_numpy(shares).float()

@@ -23,6 +23,7 @@ from splatseg.core import FeatureMap
 from splatseg.core.boundary import boundary
 from splatseg.core.models import DeepFeatures, Image
 from splatseg.core.options import options
+from splatseg.core.threads import network_inference
 from splatseg.errors import FileFormatError, MissingFileError
 from splatseg.io.tensors import read_tensors, read_torch_file
 from splatseg.models._images import HALVES, PatchGrid, patch_grid, patch_input
@@ -129,7 +130,7 @@ class LSeg(BatchedNetwork[Tensor]):
         """
         head = self._network.head
         check_shape("decoded", decoded, (*decoded.shape[:-1], head.in_channels))
-        with torch.inference_mode():
+        with network_inference():
             found = self._network.in_word_space(decoded.to(self._place.device)).cpu()
         return found.clone()  # outside, so that it is an ordinary tensor
 
@@ -147,7 +148,7 @@ class LSeg(BatchedNetwork[Tensor]):
             self._tokenizer = self._read_tokenizer()
         tokens = self._tokenizer.of(words)
         last = tokens["attention_mask"].sum(dim=1) - 1
-        with torch.inference_mode():
+        with network_inference():
             found = F.normalize(self._network.text(tokens["input_ids"], last).float(), dim=-1).cpu()
         return found.clone()
 
@@ -166,7 +167,7 @@ class LSeg(BatchedNetwork[Tensor]):
         return tokens
 
     @override
-    @torch.inference_mode()
+    @network_inference()
     def _encode(self, images: Sequence[Image]) -> list[Tensor]:
         """The decoder's map of each image, (rows, columns, channels)."""
         height, width = (int(side) for side in images[0].shape[:2])

@@ -66,7 +66,8 @@ class FeatureMembershipOptions:
     prompts mean and one standard deviation, as in the paper. code: as in its published code."""
 
     threshold: Annotated[float, Meta(ge=-1, le=1)] = 0.85
-    """Similarity in [-1, 1] of the fixed rule. The published code has 0.75; docs/decisions/features.md."""
+    """Similarity in [-1, 1] of the fixed rule. The published code has 0.75;
+    docs/decisions/features.md."""
 
     seed: int = 0
     """Seed of k-means."""

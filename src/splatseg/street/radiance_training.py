@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from splatseg.core import View
 from splatseg.core.boundary import boundary
-from splatseg.core.threads import one_torch_thread
+from splatseg.core.threads import caller_threads, one_torch_thread
 from splatseg.errors import InputError
 from splatseg.io.evidence import Evidence
 from splatseg.lift.training import AdamConstants, RowAdam, RowMoments
@@ -305,7 +305,7 @@ def train_radiance(
         raise InputError("ids: expected ids of classes where there is no evidence, got none.")
     found = label_ids(views, evidence) if ids is None and evidence is not None else ids or ()
     classes = checked_ids(tuple(found))
-    threads = torch.get_num_threads()
+    threads = caller_threads()
     with ExitStack() as stack:
         stack.enter_context(one_torch_thread())
         rays = training_rays(views, evidence, classes, read=read)

@@ -1,13 +1,11 @@
 """A generated scene as a capture on disk, as a camera and a labelling network would leave it."""
 
 import json
-from collections.abc import Callable, Generator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
@@ -15,6 +13,7 @@ from torch import Tensor
 from splatseg.core import Camera, PointCloud, View
 from splatseg.core.boundary import boundary
 from splatseg.core.evidence import UNLABELLED
+from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError
 from splatseg.io.atomic import atomic_folder
 from splatseg.synthetic.photographs import cameras, machine_labels, start_points
@@ -75,7 +74,7 @@ def write_capture(
         if _intrinsics(view.camera) != intrinsics:
             raise InputError(f"views: expected the same intrinsics, {view.name} has others.")
     truths: dict[str, Truth] = {}
-    with _one_thread():
+    with one_torch_thread():
         for i, view in enumerate(chosen):
             truths[view.name] = render_truth(scene, view.camera)
             if progress is not None:
@@ -93,20 +92,6 @@ def write_capture(
         _save_json(_transforms(chosen, intrinsics), target / "transforms.json")
         _save_json(_metadata(scene, chosen, truths), target / "metadata.json")
     return truths
-
-
-@contextmanager
-def _one_thread() -> Generator[None]:
-    """Let torch compute on one thread: many small steps wait for each other otherwise.
-
-    On a busy machine of two cores that made photographing ten times slower.
-    """
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def _save_images(folder: Path, truths: Mapping[str, Truth], labels: Mapping[str, Tensor]) -> None:

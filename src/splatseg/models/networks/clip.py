@@ -20,6 +20,7 @@ from splatseg.core import FeatureMap
 from splatseg.core.boundary import boundary
 from splatseg.core.models import Image
 from splatseg.core.options import options
+from splatseg.core.threads import network_inference
 from splatseg.errors import FileFormatError
 from splatseg.models._images import HALVES, Normalisation, PatchGrid, patch_grid, patch_input
 from splatseg.models._weights import Loading
@@ -85,7 +86,7 @@ class JointSpace(BatchedNetwork[FeatureMap]):
         return self._last.of(image)
 
     @boundary
-    @torch.inference_mode()
+    @network_inference()
     def encode_text(self, words: Sequence[str]) -> Float[Tensor, "n width"]:
         """Unit vectors of words, each in the sentence of the option `template`.
 
@@ -98,7 +99,7 @@ class JointSpace(BatchedNetwork[FeatureMap]):
         return F.normalize(self._sentences(texts).float().cpu(), dim=-1)
 
     @override
-    @torch.inference_mode()
+    @network_inference()
     def _encode(self, images: Sequence[Image]) -> list[FeatureMap]:
         height, width = (int(side) for side in images[0].shape[:2])
         grid = patch_grid(height, width, patch=self.patch, size=self._input_size)

@@ -22,6 +22,7 @@ from typing_extensions import override
 from splatseg.core import ClassTable, DepthMap, FeatureMap, LabelMap
 from splatseg.core.models import DeepFeatures, Image
 from splatseg.core.options import Count, Positive, options
+from splatseg.core.threads import network_inference
 from splatseg.errors import RangeError
 from splatseg.models._images import HALVES, InputSize, Normalisation, patch_grid, patch_input
 from splatseg.models._weights import Loading
@@ -94,7 +95,7 @@ class Dino(BatchedNetwork[DeepFeatures]):
         return self._last.of(image)
 
     @override
-    @torch.inference_mode()
+    @network_inference()
     def _encode(self, images: Sequence[Image]) -> list[DeepFeatures]:
         height, width = (int(side) for side in images[0].shape[:2])
         grid = patch_grid(height, width, patch=self._patch, size=self._input_size)
@@ -176,7 +177,7 @@ class DepthNetwork(BatchedNetwork[DepthMap]):
         return self._last.of(image)
 
     @override
-    @torch.inference_mode()
+    @network_inference()
     def _encode(self, images: Sequence[Image]) -> list[DepthMap]:
         height, width = (int(side) for side in images[0].shape[:2])
         frame = self._size.frame(height, width, size=self._place.size)
@@ -225,7 +226,7 @@ class SemanticNetwork(BatchedNetwork[Tensor]):
         )  # fmt: skip
 
     @override
-    @torch.inference_mode()
+    @network_inference()
     def _encode(self, images: Sequence[Image]) -> list[Float[Tensor, "classes rows columns"]]:
         height, width = (int(side) for side in images[0].shape[:2])
         frame = self._size.frame(height, width, size=self._place.size)

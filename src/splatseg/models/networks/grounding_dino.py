@@ -15,6 +15,7 @@ from typing_extensions import override
 from splatseg.core import Rle
 from splatseg.core.models import Boxes, Image, Prompt, TextMasks
 from splatseg.core.options import Share, options
+from splatseg.core.threads import network_inference
 from splatseg.errors import InputError
 from splatseg.models._images import Frame, Normalisation, frame_of, input_side
 from splatseg.models._mask_generator import distinct
@@ -81,7 +82,7 @@ class GroundingDino(NetworkModel):
         """
         return self.boxes_of([image], words)[0]
 
-    @torch.inference_mode()
+    @network_inference()
     def boxes_of(self, images: Sequence[Image], words: Sequence[str]) -> list[Boxes]:
         """`boxes` of images of one size, which pass the network together."""
         height, width = (int(side) for side in images[0].shape[:2])

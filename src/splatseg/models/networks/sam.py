@@ -16,6 +16,7 @@ from typing_extensions import override
 
 from splatseg.core import FeatureMap, MaskSet, Rle
 from splatseg.core.models import DeepFeatures, Embedding, Image, Prompt
+from splatseg.core.threads import network_inference
 from splatseg.models._images import HALVES, Frame, Normalisation, frame_of
 from splatseg.models._mask_generator import (
     STABILITY_OFFSET,
@@ -195,7 +196,7 @@ class Sam(BatchedNetwork[_Seen]):
         return frame_of(height, width, size=self._input_size, shape=self._kind.shape)
 
     @override
-    @torch.inference_mode()
+    @network_inference()
     def _encode(self, images: Sequence[Image]) -> list[_Seen]:
         frame = self._frame(*(int(side) for side in images[0].shape[:2]))
         maps = answering(self._place.folder, self._maps)(self._input(images, frame))
@@ -222,7 +223,7 @@ class Sam(BatchedNetwork[_Seen]):
         sides = [round(one.shape[2] ** 0.5) for one in maps]
         return [one.reshape(*one.shape[:2], n, n) for one, n in zip(maps, sides, strict=True)]
 
-    @torch.inference_mode()
+    @network_inference()
     def _decode(
         self,
         seen: _Seen,

@@ -18,6 +18,7 @@ from splatseg._check import check_shape
 from splatseg.core import UNLABELLED, LabelMap
 from splatseg.core.models import Image
 from splatseg.core.options import Count, options
+from splatseg.core.threads import network_inference
 from splatseg.errors import MissingPackageError
 from splatseg.models._images import HALVES, Normalisation, frame_of
 from splatseg.models._weights import Loading
@@ -101,7 +102,7 @@ class VideoMemory:
         for frames in self._session.frames_tracked_per_obj.values():
             frames.clear()
 
-    @torch.inference_mode()
+    @network_inference()
     def follow(
         self, pixels: Float[Tensor, "1 3 side side"], seeds: Mapping[int, Tensor]
     ) -> tuple[tuple[int, ...], Float[Tensor, "n rows columns"], Float[Tensor, "n"]]:

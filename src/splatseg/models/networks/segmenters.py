@@ -26,6 +26,7 @@ from torch import Tensor
 from splatseg.core import UNLABELLED, ClassInfo, ClassTable, LabelMap, Segment
 from splatseg.core.models import Image, Panoptic
 from splatseg.core.options import Share, options
+from splatseg.core.threads import network_inference
 from splatseg.errors import InputError
 from splatseg.io.json_files import read_json
 from splatseg.io.label_tables import TABLES, is_void_name, label_table
@@ -424,7 +425,7 @@ class Segmenter(NetworkModel):
             return frame_of(height, width, size=self._side, shape="padded")
         return self._size.frame(height, width, size=self._place.size)
 
-    @torch.inference_mode()
+    @network_inference()
     def _encode(self, task: Task, images: Sequence[Image]) -> list[Queries | _Windows]:
         frame = self._frame(*(int(side) for side in images[0].shape[:2]))
         batch = self._input(images, frame, padding="black")
@@ -440,7 +441,7 @@ class Segmenter(NetworkModel):
             )
         ]
 
-    @torch.inference_mode()
+    @network_inference()
     def _encode_windows(self, images: Sequence[Image]) -> list[Queries | _Windows]:
         """Scores in windows of the network's size along the longer side, averaged over overlaps."""
         side = cast(int, self._side)

@@ -17,6 +17,7 @@ from splatseg.core import UNLABELLED, ClassTable, LabelMap, MaskSet, Rle, Segmen
 from splatseg.core.boundary import boundary
 from splatseg.core.models import Image, Panoptic, TextMasks
 from splatseg.core.options import Share, options
+from splatseg.core.threads import network_inference
 from splatseg.errors import FileFormatError, RangeError, quoted
 from splatseg.models._images import HALVES, LastImages, Normalisation, frame_of, input_side
 from splatseg.models._weights import Loading
@@ -148,7 +149,7 @@ class Sam3Text(WordMasks):
         self._seen = LastImages[Any](self._see, resizable=False)
 
     @override
-    @torch.inference_mode()
+    @network_inference()
     def _find(self, images: Sequence[Image], words: Sequence[str]) -> list[TextMasks]:
         if not words:
             return [self._masks_of(image, []) for image in images]
@@ -160,7 +161,7 @@ class Sam3Text(WordMasks):
         ]
         return [self._masks_of(image, asked) for image in images]
 
-    @torch.inference_mode()
+    @network_inference()
     def _see(self, images: Sequence[Image]) -> list[Any]:
         height, width = (int(side) for side in images[0].shape[:2])
         frame = frame_of(height, width, size=self._input_size, shape="square")
@@ -266,7 +267,7 @@ class ClipSeg(BatchedNetwork[Tensor]):
         ids[probability < self._threshold] = UNLABELLED
         return LabelMap(ids=ids, confidence=probability)
 
-    @torch.inference_mode()
+    @network_inference()
     def _encode_words(self, tokens: Tokens, texts: Sequence[str]) -> Float[Tensor, "words width"]:
         found = tokens.of(texts)
         return self._network.get_conditional_embeddings(
@@ -276,7 +277,7 @@ class ClipSeg(BatchedNetwork[Tensor]):
         )
 
     @override
-    @torch.inference_mode()
+    @network_inference()
     def _encode(self, images: Sequence[Image]) -> list[Tensor]:
         """Logits (words, size, size) of images. The image's encoder runs once for all words."""
         height, width = (int(side) for side in images[0].shape[:2])
