@@ -12,10 +12,9 @@ import time
 from pathlib import Path
 
 import torch
-from splatseg.fit._state import FitState
-from splatseg.io.npz_writing import discard_checkpoint_file
 
-from splatseg.fit._checkpoint import read_checkpoint, write_checkpoint
+from splatseg.fit._checkpoint import FitState, read_checkpoint, write_checkpoint
+from splatseg.io.arrays import discard_checkpoint_file
 
 _WIDTHS = {"means": 3, "log_scales": 3, "rotations": 4, "logits": 1, "sh": 48}
 

@@ -44,13 +44,13 @@ from click_targets import NOISY_CLICKS, ClickTarget, GroupedParts, Targets
 from numpy.typing import NDArray
 from per_view_masks import PerViewMasks
 from selected_views import TestViews
-from splatseg.lift.mass.segment_masses import view_masses
 
 from splatseg.core import Features, LabelMap, Selection, View
 from splatseg.errors import InputError
 from splatseg.io.evidence import open_evidence
 from splatseg.io.scene import load_scene, load_scene_layer
 from splatseg.lift import uplift
+from splatseg.lift.voting.segment_masses import view_masses
 from splatseg.prompting.feature_source import (
     FeatureMembership,
     FeatureMembershipOptions,

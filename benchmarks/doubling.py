@@ -27,7 +27,6 @@ import numpy as np
 import torch
 from memory import room
 from scipy.spatial import cKDTree
-from splatseg.lift.pipeline import lift_labels
 
 from lift import HEIGHT, WIDTH, camera
 from splatseg.core import Gaussians, LabelMap, Labels, MaskSet, Rle, Scene, View
@@ -36,6 +35,7 @@ from splatseg.io.layers import save_layer
 from splatseg.io.scene import save_scene
 from splatseg.lift import complete, label_map, uplift
 from splatseg.methods.associate import associate
+from splatseg.methods.uplift import lift_labels
 from splatseg.render import render
 from splatseg.tasks.edit import edit_scene
 from splatseg.tasks.edit_operations import EditOptions

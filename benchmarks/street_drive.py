@@ -33,7 +33,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image
-from splatseg.street.sources import scan_points
 from torch import Tensor
 
 from splatseg.core import Camera, Capture, LabelledMesh, LayerInfo, Scan, View
@@ -50,12 +49,16 @@ from splatseg.street.blocks import (
 from splatseg.street.depth_views import scan_views
 from splatseg.street.field import MeshField
 from splatseg.street.geometry import GeometryOptions, fit_geometry
+from splatseg.street.method import scan_points
 from splatseg.street.primitives import voxel_primitives
 from splatseg.street.radiance import RadianceOptions
 from splatseg.street.radiance_training import train_radiance
 from splatseg.street.shape_files import load_shapes
 from splatseg.street.shapes import ShapeAutoEncoder, sphere_code
-from splatseg.synthetic import STREET_CLASSES, look_at, scene_mesh, street
+from splatseg.synthetic import look_at
+from splatseg_bench.worlds._classes import STREET_CLASSES
+from splatseg_bench.worlds._recorded import scene_mesh
+from splatseg_bench.worlds._streets import street
 
 LAYER = "semantic"
 PIECE = 200.0

@@ -28,8 +28,6 @@ import numpy as np
 import torch
 from PIL import Image
 from scored import _SCORE
-from splatseg.street.mesh import PrimitiveMesh
-from splatseg.street.options import DnmpOptions
 from torch import nn
 
 from splatseg.core import Scene, View
@@ -38,21 +36,15 @@ from splatseg.io.captures import read_capture
 from splatseg.io.evidence import open_evidence
 from splatseg.io.scans import read_scans
 from splatseg.io.scene import load_scene
-from splatseg.street.build import seen_shares
+from splatseg.street.build import DnmpOptions, seen_shares
 from splatseg.street.field import MeshField
 from splatseg.street.files import save_mesh_field
 from splatseg.street.geometry import fit_geometry
 from splatseg.street.hits import MeshCaster
-from splatseg.street.primitives import voxel_primitives
-from splatseg.street.radiance import (
-    PUBLISHED_RADIANCE,
-    RadianceFit,
-    RadianceModel,
-    RadianceOptions,
-    RadianceRecord,
-    render_view,
-    train_radiance,
-)
+from splatseg.street.primitives import PrimitiveMesh, voxel_primitives
+from splatseg.street.radiance import PUBLISHED_RADIANCE, RadianceModel, RadianceOptions
+from splatseg.street.radiance_rendering import render_view
+from splatseg.street.radiance_training import RadianceFit, RadianceRecord, train_radiance
 from splatseg.street.shape_files import load_shapes
 from splatseg.tasks.street_inputs import capture_points, drive_sources
 from splatseg.tasks.work import Work, scene_of_capture

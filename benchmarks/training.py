@@ -33,7 +33,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image
-from splatseg.tasks.segment_options import SegmentOptions
 from street_field import peak
 from torch.utils.flop_counter import FlopCounterMode
 
@@ -52,7 +51,7 @@ from splatseg.lift.training import (
 )
 from splatseg.methods import find_method
 from splatseg.methods.identity import IdentityOptions, TrainingContext, train_identity
-from splatseg.tasks.segment import segment
+from splatseg.tasks.segment import SegmentOptions, segment
 
 SCORER = Path(__file__).resolve().parents[1] / ".." / "shared" / "score" / "score.py"
 CHANNELS = 16
