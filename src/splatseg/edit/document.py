@@ -113,24 +113,23 @@ class Operation:
 
     def to_json(self) -> dict[str, Any]:
         """As values that JSON holds. Inverse of `from_json`."""
-        content: dict[str, Any] = {"kind": self.kind}
-        if self.where is not None:
-            content["where"] = self.where.to_json()
+        moved = None
         if self.transform is not None:
-            content["transform"] = {
+            moved = {
                 "rotation": self.transform.rotation.double().tolist(),
                 "translation": self.transform.translation.double().tolist(),
                 "scale": float(self.transform.scale),
             }
-        if self.recolour is not None:
-            content["recolour"] = _lists(asdict(self.recolour))
-        if self.other is not None:
-            content["other"] = self.other
-        if self.cut is not None:
-            content["cut"] = _lists(asdict(self.cut))
-        if self.specks is not None:
-            content["specks"] = self.specks
-        return content
+        content = {
+            "kind": self.kind,
+            "where": None if self.where is None else self.where.to_json(),
+            "transform": moved,
+            "recolour": None if self.recolour is None else _lists(asdict(self.recolour)),
+            "other": self.other,
+            "cut": None if self.cut is None else _lists(asdict(self.cut)),
+            "specks": self.specks,
+        }
+        return {name: value for name, value in content.items() if value is not None}
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> "Operation":

@@ -7,14 +7,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from splatseg.core import (
-    LOSS_CURVE,
-    UNLABELLED,
-    ClassTable,
-    Labels,
-    LayerInfo,
-    RenderableLayer,
-)
+from splatseg.core import LOSS_CURVE, UNLABELLED, ClassTable, Labels, LayerInfo, RenderableLayer
 from splatseg.evaluate.agreement import SEEN_WEIGHT, contested, rivals
 from splatseg.report.chart import Chart, Line
 from splatseg.report.html import Bars, Block, Cell, Curves, Table

@@ -27,11 +27,7 @@ from splatseg.io.export import check_parent, column_table_of, label_columns, wri
 from splatseg.io.scene import load_scene, save_scene, save_scene_layer, scene_layer_names
 from splatseg.io.scene_folder import is_scene, work_on_scene
 from splatseg.io.splats import Values, read_scene_splats
-from splatseg.lift import (
-    GaussianMatches,
-    MatchOptions,
-    match_gaussians,
-)
+from splatseg.lift import GaussianMatches, MatchOptions, match_gaussians
 from splatseg.tasks.export_labels import label_tables
 from splatseg.tasks.import_scene import read_with_notes
 from splatseg.tasks.work import SILENT, Observer, Work, versions

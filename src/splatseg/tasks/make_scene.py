@@ -40,12 +40,7 @@ from splatseg.tasks.moving import (
     moving_things,
     without_moving_points,
 )
-from splatseg.tasks.photographs import (
-    MakeSceneOptions,
-    capture_of,
-    with_depth_evidence,
-    with_scans,
-)
+from splatseg.tasks.photographs import MakeSceneOptions, capture_of, with_depth_evidence, with_scans
 from splatseg.tasks.work import (
     REPORTS_FOLDER,
     SILENT,

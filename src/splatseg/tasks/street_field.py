@@ -19,6 +19,7 @@ from splatseg.io.scene import load_scene, new_field_file, remove_field_folder, s
 from splatseg.io.scene_folder import is_scene, scene_lock
 from splatseg.render import BackendName
 from splatseg.report.street_report import DepthError
+from splatseg.report.words import spread
 from splatseg.street.build import (
     PUBLISHED,
     DnmpOptions,
@@ -47,7 +48,6 @@ from splatseg.tasks.work import (
     check_new_folder,
     layer_versions,
     scene_of_capture,
-    spread_views,
     view_spec,
 )
 
@@ -80,7 +80,7 @@ class KeptDepths:
 
     def __init__(self, depths: Iterable[DepthView], views: Sequence[View]) -> None:
         self._depths = depths
-        self._wanted = spread_views(views, _VIEWS)
+        self._wanted = spread(views, _VIEWS)
         self.samples: list[DepthSample] = []
 
     def __iter__(self) -> Iterator[DepthView]:
