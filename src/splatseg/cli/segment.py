@@ -11,7 +11,7 @@ import tyro
 
 from splatseg.cli._shared import OnScene, Overwrite, Seed, print_result, typed
 from splatseg.cli._words import option_value
-from splatseg.core import UNLABELLED, Features, Scene, Selection, VoxelFeatures
+from splatseg.core import UNLABELLED, Features, Selection, VoxelFeatures
 from splatseg.core.instance_tree import layer_kind
 from splatseg.errors import InputError
 from splatseg.io.evidence import open_evidence
@@ -186,7 +186,17 @@ def run(command: Command) -> None:
         timings = {"load": opened}
         files: tuple[Exported, ...] = ()
         if command.export:
-            files = _export(command, scene, result, lines=lines, made=made, timings=timings)
+            began = time.monotonic()
+            files, maps = export_layer(
+                scene, command.scene, result.name, result.layer,
+                backend=command.backend, observer=observer,
+            )  # fmt: skip
+            timings["export"] = time.monotonic() - began
+            lines += [f"{file.summary} in {file.output}" for file in files]
+            made["exports"] = [file.output for file in files]
+            if maps is not None:
+                lines.append(f"label maps of {maps.views} views in {maps.folder}")
+                made["exports"].append(maps.folder)
         if command.report:
             where = report_layer(
                 scene,
@@ -202,34 +212,6 @@ def run(command: Command) -> None:
             made["report"] = where
     made["seconds"] = round(time.monotonic() - started, 3)
     print_result(made, lines, json=command.json)
-
-
-def _export(
-    command: Command,
-    scene: Scene,
-    result: Segmentation,
-    *,
-    lines: list[str],
-    made: dict[str, Any],
-    timings: dict[str, float],
-) -> tuple[Exported, ...]:
-    """Write the exports, and add what they are to what is printed."""
-    began = time.monotonic()
-    files, maps = export_layer(
-        scene,
-        command.scene,
-        result.name,
-        result.layer,
-        backend=command.backend,
-        observer=command.observer,
-    )
-    timings["export"] = time.monotonic() - began
-    lines += [f"{file.summary} in {file.output}" for file in files]
-    made["exports"] = [file.output for file in files]
-    if maps is not None:
-        lines.append(f"label maps of {maps.views} views in {maps.folder}")
-        made["exports"].append(maps.folder)
-    return files
 
 
 def _facts(result: Segmentation, path: Path) -> dict[str, Any]:

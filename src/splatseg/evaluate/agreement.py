@@ -16,7 +16,7 @@ from splatseg.core.boundary import boundary
 from splatseg.errors import InputError
 from splatseg.evaluate.metrics import id_pair
 from splatseg.evaluate.overlaps import Overlaps
-from splatseg.io.images import reduced_size
+from splatseg.io.images import image_camera
 from splatseg.render import back_project
 
 SEEN_WEIGHT = 0.5
@@ -50,9 +50,8 @@ def views_that_show(
     """
     counts = torch.zeros(len(gaussians), dtype=torch.int64)
     for done, view in enumerate(views, start=1):
-        width, height = reduced_size(view.camera.width, view.camera.height, longest)
-        camera = view.camera.resized(width, height)
-        ones = gaussians.means.new_zeros(height, width, 1)
+        camera = image_camera(view, longest)
+        ones = gaussians.means.new_zeros(camera.height, camera.width, 1)
         with torch.no_grad():
             seen = back_project(gaussians, camera, ones, backend=backend)
         counts += seen.weights.cpu() >= min_weight

@@ -15,7 +15,7 @@ from splatseg.core.boundary import boundary
 from splatseg.edit import Document, Operation, apply, load_document, prepare, save_document, undo
 from splatseg.edit.document import BASE, HISTORY
 from splatseg.errors import InputError, MissingFileError
-from splatseg.io.images import reduced_size, save_png
+from splatseg.io.images import image_camera, save_png
 from splatseg.io.scene_folder import is_scene
 from splatseg.lift import CutOptions
 from splatseg.render import BackendName, render
@@ -73,10 +73,7 @@ def _row(
 
 
 def _small_image(scene: Scene, name: str, longest: int, backend: BackendName) -> Tensor:
-    camera = scene.view(name).camera
-    size = reduced_size(camera.width, camera.height, longest)
-    if size != (camera.width, camera.height):
-        camera = camera.resized(*size)
+    camera = image_camera(scene.view(name), longest)
     return render(scene.gaussians, camera, backend=backend).image.clamp(0, 1).cpu()
 
 
