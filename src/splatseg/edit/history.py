@@ -11,7 +11,7 @@ from typing import Any, cast
 
 import torch
 
-from splatseg.core import Edited, Gaussians, Scene, Selection, Similarity
+from splatseg.core import Edited, Gaussians, Scene, Selection, Similarity, View
 from splatseg.core.boundary import boundary
 from splatseg.edit.document import HISTORY, Document, Operation, Recolour, load_document
 from splatseg.edit.operations import (
@@ -103,16 +103,14 @@ def _merged(document: Document, other: Document, moved: Similarity | None) -> Do
     )
 
 
+def moved_view(view: View, new_from_old: Similarity) -> View:
+    """A view in another frame; its depth maps keep their steps, whose unit changes."""
+    unit = None if view.depth_unit is None else view.depth_unit * new_from_old.scale
+    return replace(view, camera=view.camera.moved(new_from_old), depth_unit=unit)
+
+
 def _moved_scene(scene: Scene, new_from_old: Similarity) -> Scene:
     """A scene in another frame: cameras, up and units move with the Gaussians."""
-    views = tuple(
-        replace(
-            view,
-            camera=view.camera.moved(new_from_old),
-            depth_unit=None if view.depth_unit is None else view.depth_unit * new_from_old.scale,
-        )
-        for view in scene.views
-    )
     up = scene.up
     if up is not None:
         x, y, z = (new_from_old.rotation.double() @ torch.tensor(up).double()).tolist()
@@ -121,7 +119,7 @@ def _moved_scene(scene: Scene, new_from_old: Similarity) -> Scene:
     return replace(
         scene,
         gaussians=scene.gaussians.transformed(new_from_old),
-        views=views,
+        views=tuple(moved_view(view, new_from_old) for view in scene.views),
         up=up,
         metres_per_unit=None if metres is None else metres / new_from_old.scale,
     )

@@ -14,13 +14,13 @@ from splatseg.core import (
     Layer,
     Scene,
     Similarity,
-    View,
     VoxelFeatures,
     with_info,
 )
 from splatseg.core.boundary import boundary
 from splatseg.core.options import Share
 from splatseg.core.options import options as options_class
+from splatseg.edit.history import moved_view
 from splatseg.errors import InputError
 from splatseg.io.atomic import is_vacant
 from splatseg.io.export import check_parent, column_table_of, label_columns, write_labelled_splats
@@ -354,17 +354,12 @@ def _moved(scene: Scene, found: GaussianMatches, observer: Observer) -> Scene:
     move = first.edited_from_source
     return replace(
         scene,
-        views=tuple(_moved_view(view, move) for view in scene.views),
+        views=tuple(moved_view(view, move) for view in scene.views),
         up=None if scene.up is None else _turned(scene.up, move),
         metres_per_unit=None
         if scene.metres_per_unit is None
         else scene.metres_per_unit / move.scale,
     )
-
-
-def _moved_view(view: View, move: Similarity) -> View:
-    unit = None if view.depth_unit is None else view.depth_unit * move.scale
-    return replace(view, camera=view.camera.moved(move), depth_unit=unit)
 
 
 def _turned(up: tuple[float, float, float], move: Similarity) -> tuple[float, float, float]:
