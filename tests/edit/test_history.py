@@ -333,7 +333,7 @@ def test_masks_are_refused_after_things_moved(document) -> None:
             InputError,
             "specks: .* got 1.5",
         ),
-        ({"kind": "remove", "where": {"layer": "a"}, "specks": -1}, RangeError, "0 or more"),
+        ({"kind": "remove", "where": {"layer": "a"}, "specks": -1}, RangeError, "at least 0"),
         ({"kind": "extract", "where": {"layer": "a"}, "specks": 9}, InputError, "takes no specks"),
         ({"kind": "remove", "where": 3}, InputError, "where: expected an object or null, got 3"),
         ({"kind": "remove", "why": 3}, InputError, "expected the keys of an edit, got 'why'"),

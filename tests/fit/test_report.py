@@ -14,6 +14,7 @@ from splatseg.fit import FitOptions, FitResult, fit
 from splatseg.io.scene import save_scene
 from splatseg.lift import GaussianField
 from splatseg.pose import PoseReport
+from splatseg.report.fit_report import verdict_of
 from splatseg.tasks.make_scene import score_and_report
 
 OPTIONS = FitOptions(minutes=None, steps=120, max_gaussians=70, seed=3, background="black")
@@ -53,7 +54,7 @@ class Page(HTMLParser):
 
 def test_a_finished_fit(fitted) -> None:
     root, capture, result = fitted
-    done = score_and_report(
+    done, where = score_and_report(
         root,
         capture,
         result,
@@ -62,7 +63,7 @@ def test_a_finished_fit(fitted) -> None:
         scoring=True,
         timings={"optimisation": 61.5},
     )
-    found, where = done.scores, done.report
+    found = done.scores
     scores = evaluate_photographs(
         GaussianField(result.gaussians, backend="cpu"), capture.test_views
     )
@@ -78,7 +79,7 @@ def test_a_finished_fit(fitted) -> None:
     assert record["seed"] == 3
     assert (record["sensible_steps"], record["too_short"]) == (1000, True)
     assert record["verdict"].startswith("Too short. 120 steps done, where 1000 or more")
-    assert done.verdict.too_short
+    assert verdict_of(done).too_short
     assert record["seconds_by_part"].keys() == {"optimisation", "scores and report"}
     assert record["options"]["max_gaussians"] == 70
     assert record["held_out"]["psnr"] == pytest.approx(scores.psnr)
@@ -124,7 +125,9 @@ def test_a_finished_fit(fitted) -> None:
 def test_an_interrupted_fit_is_not_scored(fitted) -> None:
     root, capture, result = fitted
     stopped = replace(result, interrupted=True)
-    done = score_and_report(root, capture, stopped, options=OPTIONS, backend="cpu", scoring=False)
+    done, _ = score_and_report(
+        root, capture, stopped, options=OPTIONS, backend="cpu", scoring=False
+    )
     assert done.scores is None
     record = json.loads((root / "reports" / "fit.json").read_text())
     assert record["interrupted"] is True
@@ -140,7 +143,7 @@ def test_one_held_out_view_and_none(fitted) -> None:
     for count, images in ((1, 3 + 2), (0, 2)):
         views = (*capture.train_views, *capture.test_views[:count])
         fewer = replace(capture, views=views)
-        done = score_and_report(
+        done, _ = score_and_report(
             root, fewer, replace(result, views=views), options=OPTIONS, backend="cpu", scoring=True
         )
         assert (done.scores is not None) == (count > 0)

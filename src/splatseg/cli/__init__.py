@@ -19,7 +19,7 @@ from importlib.metadata import entry_points
 from typing import Any
 
 from splatseg.cli._streams import interrupted_by_signals, prepare_streams, silence, tell
-from splatseg.cli._words import default_config, field_names, kept_page, option_names, with_flags
+from splatseg.cli._words import default_config, kept_page, option_names, with_flags
 from splatseg.errors import InputError, MissingPackageError, SplatsegError, visible
 
 _MAX_UNPACKED = re.compile("--max-unpacked(=.*)?")
@@ -282,7 +282,7 @@ def _run(entry: CommandEntry, name: str, words: list[str]) -> int:
     except (InputError, KeyboardInterrupt) as error:
         # Tasks speak of options by their names in Python.
         if error.args:
-            error.args = (with_flags(str(error), field_names(command)),)
+            error.args = (with_flags(str(error), option_names(kind)),)
         raise
     return EXIT_DONE
 

@@ -41,7 +41,7 @@ def parse(
         made = tyro.cli(shown, prog=prog, args=list(words), config=config)
     except _UnreadableError as error:
         raise InputError(str(error)) from error
-    return _original(made, command)
+    return _with_values_of(made, command)
 
 
 def _refuse_removed(command: type[Any], words: Sequence[str], config: tuple[Any, ...]) -> None:
@@ -116,7 +116,7 @@ def _readable(command: type[Any], names: Collection[str]) -> type[Any]:
             inner = _readable(cast("type[Any]", kind), names)
             value = factory() if factory is not dataclasses.MISSING else default
             if value is not dataclasses.MISSING:
-                default = _copied(value, inner)
+                default = _with_values_of(value, inner)
             factory = dataclasses.MISSING
             kind = inner
         configured = [note for note in notes if _is_argument(note)]
@@ -156,28 +156,16 @@ def _readable(command: type[Any], names: Collection[str]) -> type[Any]:
     return shown
 
 
-def _original(value: object, kind: type[Any]) -> object:
-    """An instance of `kind` with the values of an instance of its readable copy."""
-    hints = get_type_hints(kind, include_extras=True)
+def _with_values_of(value: object, kind: type[Any]) -> Any:
+    """An instance of a class from one of its readable copy, or the other way round."""
+    kinds = get_type_hints(kind)
     values: dict[str, Any] = {}
     for field in dataclasses.fields(kind):
-        inner, _ = _unwrapped(hints[field.name])
-        held = getattr(value, field.name)
+        inner, held = kinds[field.name], getattr(value, field.name)
         values[field.name] = (
-            _original(held, cast("type[Any]", inner)) if dataclasses.is_dataclass(inner) else held
-        )
-    return kind(**values)
-
-
-def _copied(value: Any, kind: type[Any]) -> Any:
-    """An instance of a readable copy with the values of an original."""
-    hints = get_type_hints(kind, include_extras=True)
-    values: dict[str, Any] = {}
-    for field in dataclasses.fields(kind):
-        inner, _ = _unwrapped(hints[field.name])
-        held = getattr(value, field.name)
-        values[field.name] = (
-            _copied(held, cast("type[Any]", inner)) if dataclasses.is_dataclass(inner) else held
+            _with_values_of(held, cast("type[Any]", inner))
+            if dataclasses.is_dataclass(inner)
+            else held
         )
     return kind(**values)
 

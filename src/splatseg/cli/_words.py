@@ -48,16 +48,6 @@ def listed(flag: str, words: Sequence[str]) -> tuple[str, ...]:
     return names
 
 
-def field_names(command: object) -> set[str]:
-    """Names of all fields of a parsed command, those of nested dataclasses included."""
-    if not is_dataclass(command):
-        return set()
-    names: set[str] = set()
-    for field in fields(command):
-        names |= {field.name} | field_names(getattr(command, field.name))
-    return names
-
-
 def with_flags(message: str, fields: Collection[str]) -> str:
     """A message with the flags of a command for names of options, at its start or in backticks.
 

@@ -22,13 +22,7 @@ from splatseg.cli._shared import (
 )
 from splatseg.fit import FitOptions, Preset, Strategy
 from splatseg.report.fit_report import scored_of
-from splatseg.tasks import (
-    ImportOptions,
-    MadeScene,
-    MakeSceneOptions,
-    fit_capture,
-    import_scene,
-)
+from splatseg.tasks import ImportOptions, MadeScene, MakeSceneOptions, fit_capture, import_scene
 
 _DEFAULT = FitOptions()
 
@@ -138,10 +132,11 @@ def run(command: Command) -> None:
 
 
 def _options(command: Command) -> FitOptions:
-    options = replace(FitOptions.preset(command.preset), seed=command.seed)
+    options = FitOptions.preset(command.preset)
     scans = command.capture.scans
     options = replace(
         options,
+        seed=command.seed,
         start=command.start,
         background=command.background,
         prune_floaters=command.prune_floaters,

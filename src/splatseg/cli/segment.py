@@ -7,12 +7,11 @@ from dataclasses import dataclass, field, make_dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-import torch
 import tyro
 
 from splatseg.cli._shared import OnScene, Overwrite, Seed, print_result, typed
 from splatseg.cli._words import option_value
-from splatseg.core import UNLABELLED, Features, Labels, Scene, Selection, VoxelFeatures
+from splatseg.core import UNLABELLED, Features, Selection, VoxelFeatures
 from splatseg.core.instance_tree import layer_kind
 from splatseg.errors import InputError
 from splatseg.io.evidence import open_evidence
@@ -187,7 +186,17 @@ def run(command: Command) -> None:
         timings = {"load": opened}
         files: tuple[Exported, ...] = ()
         if command.export:
-            files = _export(command, scene, result, lines=lines, made=made, timings=timings)
+            began = time.monotonic()
+            files, maps = export_layer(
+                scene, command.scene, result.name, result.layer,
+                backend=command.backend, observer=observer,
+            )  # fmt: skip
+            timings["export"] = time.monotonic() - began
+            lines += [f"{file.summary} in {file.output}" for file in files]
+            made["exports"] = [file.output for file in files]
+            if maps is not None:
+                lines.append(f"label maps of {maps.views} views in {maps.folder}")
+                made["exports"].append(maps.folder)
         if command.report:
             where = report_layer(
                 scene,
@@ -203,34 +212,6 @@ def run(command: Command) -> None:
             made["report"] = where
     made["seconds"] = round(time.monotonic() - started, 3)
     print_result(made, lines, json=command.json)
-
-
-def _export(
-    command: Command,
-    scene: Scene,
-    result: Segmentation,
-    *,
-    lines: list[str],
-    made: dict[str, Any],
-    timings: dict[str, float],
-) -> tuple[Exported, ...]:
-    """Write the exports, and add what they are to what is printed."""
-    began = time.monotonic()
-    files, maps = export_layer(
-        scene,
-        command.scene,
-        result.name,
-        result.layer,
-        backend=command.backend,
-        observer=command.observer,
-    )
-    timings["export"] = time.monotonic() - began
-    lines += [f"{file.summary} in {file.output}" for file in files]
-    made["exports"] = [file.output for file in files]
-    if maps is not None:
-        lines.append(f"label maps of {maps.views} views in {maps.folder}")
-        made["exports"].append(maps.folder)
-    return files
 
 
 def _facts(result: Segmentation, path: Path) -> dict[str, Any]:
@@ -272,37 +253,24 @@ def _check_outputs(command: Command, method: Method) -> None:
 
 def _summary(result: Segmentation, seconds: float) -> str:
     """One line on the layer."""
-    views = len(result.views)
+    end = f"from {counted(len(result.views), 'view')} in {seconds:.1f} s"
     if isinstance(result.layer, VoxelFeatures):
-        return f"{result.layer!r}, from {counted(views, 'view')} in {seconds:.1f} s"
+        return f"{result.layer!r}, {end}"
     if isinstance(result.layer, Features):
         count, channels = result.layer.values.shape
-        return (
-            f"features of {channels} channels on {count} Gaussians, "
-            f"from {counted(views, 'view')} in {seconds:.1f} s"
-        )
+        return f"features of {channels} channels on {count} Gaussians, {end}"
     if isinstance(result.layer, Selection):
         mean = result.layer.mean_confidence
         sure = "" if mean is None else f", confidence {mean:.2f}"
-        return (
-            f"{result.layer.count} of {len(result.layer)} Gaussians{sure}, "
-            f"from {counted(views, 'view')} in {seconds:.1f} s"
-        )
+        return f"{result.layer.count} of {len(result.layer)} Gaussians{sure}, {end}"
     labels = result.labels
     labelled = int((labels.ids != UNLABELLED).sum())
-    ids = len(torch.unique(labels.ids[labels.ids != UNLABELLED]))
+    background = labels.info.names.get(labels.background, f"id {labels.background}")
     share = 100 * labelled / max(len(labels), 1)
     inferred = 0 if labels.inferred is None else int(labels.inferred.sum())
     guessed = f", {inferred} of them inferred from neighbours" if inferred else ""
     return (
         f"{labelled} of {len(labels)} Gaussians labelled ({share:.1f} %){guessed}, "
-        f"{counted(ids, 'id')}, from {counted(views, 'view')} in {seconds:.1f} s; "
-        f"background: {_background(labels)}"
+        f"{counted(len(labels.present), 'id')}, {end}; "
+        f"background: {'none' if labels.background == UNLABELLED else background}"
     )
-
-
-def _background(labels: Labels) -> str:
-    id = labels.background
-    if id == UNLABELLED:
-        return "none"
-    return labels.info.names.get(id, f"id {id}")

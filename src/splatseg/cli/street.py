@@ -8,15 +8,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from splatseg.cli._shared import (
-    Backend,
-    Data,
-    Overwrite,
-    Printing,
-    Seed,
-    print_result,
-    typed,
-)
+from splatseg.cli._shared import Backend, Data, Overwrite, Printing, Seed, print_result, typed
 from splatseg.errors import InputError
 from splatseg.io.scene import scene_field_path
 from splatseg.report.words import counted

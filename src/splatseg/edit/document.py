@@ -10,7 +10,8 @@ import torch
 
 from splatseg.core import Edited, Layer, Scene, Similarity, apply_rows
 from splatseg.core.boundary import boundary, convert_fields
-from splatseg.errors import InputError, RangeError, ShapeError
+from splatseg.core.options import Natural
+from splatseg.errors import InputError, ShapeError
 from splatseg.io.atomic import is_vacant
 from splatseg.io.scene import load_scene, load_scene_layer, save_scene, scene_layer_names
 from splatseg.io.schema import structured
@@ -88,7 +89,7 @@ class Operation:
     cut: CutBy | None = None
     """How what straddles the boundary is split first; None splits nothing."""
 
-    specks: int | None = None
+    specks: Natural | None = None
     """Most Gaussians of a piece that goes along because it touches nothing but what is removed;
     None leaves all pieces."""
 
@@ -106,31 +107,28 @@ class Operation:
             raise InputError(f"{self.kind}: expected {name}, got none.")
         for name in sorted(given - must - may):
             raise InputError(f"{self.kind}: takes no {name}.")
-        if self.specks is not None and self.specks < 0:
-            raise RangeError(f"specks: expected 0 or more, got {self.specks}.")
         if self.cut is not None and self.where is None:
             raise InputError(f"{self.kind}: expected where to cut, got none.")
 
     def to_json(self) -> dict[str, Any]:
         """As values that JSON holds. Inverse of `from_json`."""
-        content: dict[str, Any] = {"kind": self.kind}
-        if self.where is not None:
-            content["where"] = self.where.to_json()
+        moved = None
         if self.transform is not None:
-            content["transform"] = {
+            moved = {
                 "rotation": self.transform.rotation.double().tolist(),
                 "translation": self.transform.translation.double().tolist(),
                 "scale": float(self.transform.scale),
             }
-        if self.recolour is not None:
-            content["recolour"] = _lists(asdict(self.recolour))
-        if self.other is not None:
-            content["other"] = self.other
-        if self.cut is not None:
-            content["cut"] = _lists(asdict(self.cut))
-        if self.specks is not None:
-            content["specks"] = self.specks
-        return content
+        content = {
+            "kind": self.kind,
+            "where": None if self.where is None else self.where.to_json(),
+            "transform": moved,
+            "recolour": None if self.recolour is None else _lists(asdict(self.recolour)),
+            "other": self.other,
+            "cut": None if self.cut is None else _lists(asdict(self.cut)),
+            "specks": self.specks,
+        }
+        return {name: value for name, value in content.items() if value is not None}
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> "Operation":

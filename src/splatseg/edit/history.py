@@ -5,15 +5,15 @@ the scene that was before the first gives the same scene again; `undo` is replay
 last. Nothing is changed in place, so that whoever keeps an earlier document has it.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from typing import Any, cast
 
 import torch
 
-from splatseg.core import Edited, Gaussians, Scene, Selection, Similarity
+from splatseg.core import Edited, Gaussians, Scene, Selection, Similarity, View
 from splatseg.core.boundary import boundary
-from splatseg.edit.document import HISTORY, Document, Operation, load_document
+from splatseg.edit.document import HISTORY, Document, Operation, Recolour, load_document
 from splatseg.edit.operations import (
     duplicate,
     extract,
@@ -33,7 +33,6 @@ def apply(
     operation: Operation,
     *,
     prepared: Prepared | None = None,
-    open_other: Callable[[str], Document] = load_document,
     backend: str = "auto",
     progress: Progress | None = None,
 ) -> Document:
@@ -43,7 +42,6 @@ def apply(
         document: The scene with its layers.
         operation: The edit.
         prepared: What `prepare` made of the two, where the caller has it already.
-        open_other: Reads the scene that a merge names.
         backend: Who renders, for cuts by pixels.
         progress: Called with the views done and all there are to do.
 
@@ -62,9 +60,9 @@ def apply(
         case "split":
             after = now
         case "merge":
-            after = _merged(now, open_other(operation.other or ""), operation.transform)
+            after = _merged(now, load_document(operation.other or ""), operation.transform)
         case "transform" if chosen is None:
-            after = replace(now, scene=_moved_scene(scene, _transform(operation)))
+            after = replace(now, scene=_moved_scene(scene, cast("Similarity", operation.transform)))
         case _:
             after = now.edited(_edited(scene.gaussians, chosen, operation))
     result = {
@@ -82,33 +80,19 @@ def apply(
 
 def _edited(gaussians: Gaussians, chosen: Selection | None, operation: Operation) -> Edited:
     everything = Selection(mask=torch.ones(len(gaussians), dtype=torch.bool))
+    moved = cast("Similarity", operation.transform)  # an operation has what its kind must have
     match operation.kind:
         case "extract":
             return extract(gaussians, chosen or everything)
         case "remove":
             return remove(gaussians, chosen or everything)
         case "duplicate":
-            return duplicate(gaussians, chosen or everything, _transform(operation))
+            return duplicate(gaussians, chosen or everything, moved)
         case "transform":
-            return transform(gaussians, _transform(operation), selection=chosen)
+            return transform(gaussians, moved, selection=chosen)
         case _:
-            how = operation.recolour
-            if how is None:
-                raise InputError(f"{operation.kind}: expected recolour, got none.")
-            return recolour(
-                gaussians,
-                chosen,
-                colour=how.colour,
-                scale=how.scale,
-                shift=how.shift,
-                view_dependent=how.view_dependent,
-            )
-
-
-def _transform(operation: Operation) -> Similarity:
-    if operation.transform is None:
-        raise InputError(f"{operation.kind}: expected a transform, got none.")
-    return operation.transform
+            how = cast("Recolour", operation.recolour)
+            return recolour(gaussians, chosen, **asdict(how))
 
 
 def _merged(document: Document, other: Document, moved: Similarity | None) -> Document:
@@ -119,16 +103,14 @@ def _merged(document: Document, other: Document, moved: Similarity | None) -> Do
     )
 
 
+def moved_view(view: View, new_from_old: Similarity) -> View:
+    """A view in another frame; its depth maps keep their steps, whose unit changes."""
+    unit = None if view.depth_unit is None else view.depth_unit * new_from_old.scale
+    return replace(view, camera=view.camera.moved(new_from_old), depth_unit=unit)
+
+
 def _moved_scene(scene: Scene, new_from_old: Similarity) -> Scene:
     """A scene in another frame: cameras, up and units move with the Gaussians."""
-    views = tuple(
-        replace(
-            view,
-            camera=view.camera.moved(new_from_old),
-            depth_unit=None if view.depth_unit is None else view.depth_unit * new_from_old.scale,
-        )
-        for view in scene.views
-    )
     up = scene.up
     if up is not None:
         x, y, z = (new_from_old.rotation.double() @ torch.tensor(up).double()).tolist()
@@ -137,7 +119,7 @@ def _moved_scene(scene: Scene, new_from_old: Similarity) -> Scene:
     return replace(
         scene,
         gaussians=scene.gaussians.transformed(new_from_old),
-        views=views,
+        views=tuple(moved_view(view, new_from_old) for view in scene.views),
         up=up,
         metres_per_unit=None if metres is None else metres / new_from_old.scale,
     )
@@ -148,7 +130,6 @@ def replay(
     document: Document,
     history: Sequence[Mapping[str, Any]],
     *,
-    open_other: Callable[[str], Document] = load_document,
     backend: str = "auto",
     progress: Progress | None = None,
 ) -> Document:
@@ -157,7 +138,6 @@ def replay(
     Args:
         document: The scene with its layers before the edits.
         history: `Document.history` of the edited one, or a part of it.
-        open_other: Reads the scenes that merges name.
         backend: Who renders, for cuts by pixels.
         progress: Called with the views done and all there are to do, anew for each edit.
 
@@ -165,13 +145,8 @@ def replay(
         InputError: If an entry is no edit, or cannot be done on what it finds.
     """
     for entry in history:
-        document = apply(
-            document,
-            Operation.from_json(entry),
-            open_other=open_other,
-            backend=backend,
-            progress=progress,
-        )
+        operation = Operation.from_json(entry)
+        document = apply(document, operation, backend=backend, progress=progress)
     return document
 
 
@@ -180,7 +155,6 @@ def undo(
     base: Document,
     edited: Document,
     *,
-    open_other: Callable[[str], Document] = load_document,
     backend: str = "auto",
     progress: Progress | None = None,
 ) -> Document:
@@ -192,4 +166,4 @@ def undo(
     history = edited.history[len(base.history) :]
     if not history:
         raise InputError("undo: expected a scene with an edit, got one without.")
-    return replay(base, history[:-1], open_other=open_other, backend=backend, progress=progress)
+    return replay(base, history[:-1], backend=backend, progress=progress)

@@ -16,8 +16,8 @@ from splatseg.core.boundary import boundary
 from splatseg.errors import InputError
 from splatseg.evaluate.metrics import id_pair
 from splatseg.evaluate.overlaps import Overlaps
-from splatseg.io.images import reduced_size
-from splatseg.render import RenderOptions, back_project
+from splatseg.io.images import image_camera
+from splatseg.render import back_project
 
 SEEN_WEIGHT = 0.5
 """Blending weight, summed over a view's pixels, from which on the view shows a Gaussian: half a
@@ -34,7 +34,6 @@ def views_that_show(
     *,
     min_weight: float = SEEN_WEIGHT,
     longest: int = SEEN_LONGEST,
-    options: RenderOptions | None = None,
     backend: str = "auto",
     progress: Callable[[int, int], None] | None = None,
 ) -> Int[Tensor, "n"]:
@@ -46,17 +45,15 @@ def views_that_show(
         min_weight: Blending weight that makes a Gaussian seen; 1 is one fully visible pixel.
         longest: Larger views are looked at with their longest side reduced to this, pixels, so
             that the figure does not depend on the size of photographs.
-        options: Switches of the blending model.
         backend: Name of the rendering backend.
         progress: Called with the views done and their number.
     """
     counts = torch.zeros(len(gaussians), dtype=torch.int64)
     for done, view in enumerate(views, start=1):
-        width, height = reduced_size(view.camera.width, view.camera.height, longest)
-        camera = view.camera.resized(width, height)
-        ones = gaussians.means.new_zeros(height, width, 1)
+        camera = image_camera(view, longest)
+        ones = gaussians.means.new_zeros(camera.height, camera.width, 1)
         with torch.no_grad():
-            seen = back_project(gaussians, camera, ones, options=options, backend=backend)
+            seen = back_project(gaussians, camera, ones, backend=backend)
         counts += seen.weights.cpu() >= min_weight
         if progress is not None:
             progress(done, len(views))

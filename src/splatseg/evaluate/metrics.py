@@ -176,14 +176,13 @@ def matched_miou(confusion: Confusion) -> float:
     """
     from scipy.optimize import linear_sum_assignment
 
-    counts = confusion.counts.double()[1:, 1:]
-    in_truth = confusion.counts.double().sum(dim=1)[1:]
+    counts = confusion.counts.double()
+    in_truth, predicted = counts.sum(dim=1)[1:], counts.sum(dim=0)[1:]
     present = in_truth > 0
     if not bool(present.any()):
         raise InputError("truth: expected at least one pixel with a class, all are void.")
-    predicted = confusion.counts.double().sum(dim=0)[1:]
     used = predicted > 0
-    shared = counts[present][:, used]
+    shared = counts[1:, 1:][present][:, used]
     union = in_truth[present, None] + predicted[None, used] - shared
     iou = (shared / union).numpy()
     rows, columns = linear_sum_assignment(iou, maximize=True)

@@ -24,7 +24,8 @@ References:
     Everingham et al., The Pascal Visual Object Classes Challenge (2015): AP at IoU 0.5.
 """
 
-from collections.abc import Collection, Mapping
+from collections import Counter
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Literal, TypeVar
@@ -157,11 +158,8 @@ def _mostly_void(predicted: Tensor, truth: Tensor) -> frozenset[int]:
     return frozenset(keys[void > _MOSTLY * sizes].tolist())
 
 
-def _counts_by_class(keys: set[int]) -> dict[int, int]:
-    counts: dict[int, int] = {}
-    for key in sorted(keys):
-        counts[key_class(key)] = counts.get(key_class(key), 0) + 1
-    return counts
+def _counts_by_class(keys: Iterable[int]) -> dict[int, int]:
+    return dict(Counter(key_class(key) for key in sorted(keys)))
 
 
 def _summed(
@@ -351,14 +349,13 @@ class Detections:
                         target=None if target is None else (view, target),
                     )
                 )
-        in_truth = _by_class(overlaps.truth_sizes[0])
+        in_truth = _counts_by_class(overlaps.truth_sizes[0].tolist())
         truth = {id: count for id, count in in_truth.items() if id in things}
         return cls(rows=tuple(rows), truth=MappingProxyType(truth))
 
     def __add__(self, other: "Detections") -> "Detections":
-        classes = sorted(self.truth.keys() | other.truth.keys())
-        truth = {id: self.truth.get(id, 0) + other.truth.get(id, 0) for id in classes}
-        return Detections(rows=self.rows + other.rows, truth=MappingProxyType(truth))
+        truth = MappingProxyType(_summed(self.truth, other.truth, 0))
+        return Detections(rows=self.rows + other.rows, truth=truth)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -407,14 +404,6 @@ def _area(hits: np.ndarray, count: int) -> float:
     precision = found / np.arange(1, len(hits) + 1)
     envelope = np.maximum.accumulate(precision[::-1])[::-1]
     return float(np.sum(np.diff(np.concatenate(([0.0], found / count))) * envelope))
-
-
-def _by_class(keys: Tensor) -> dict[int, int]:
-    """How many keys each class has."""
-    counts: dict[int, int] = {}
-    for key in keys.tolist():
-        counts[key_class(key)] = counts.get(key_class(key), 0) + 1
-    return counts
 
 
 def _mean(values: list[float]) -> float:

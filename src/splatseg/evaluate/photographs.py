@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Literal
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 from torch.nn import functional
 
@@ -343,11 +343,9 @@ def _view_score(
 ) -> ViewScore | None:
     """The scores of a view; None where its mask keeps nothing that could be scored."""
     rendered, photograph = render_and_photograph(field, view, masks=masks, longest=longest)
-    mask = load_mask(view, longest=longest) if masks == "ignore" else None
-    keep = None if mask is None else mask > 0
+    keep = scored_pixels(view, masks=masks, longest=longest)
     if keep is not None:
-        border = SSIM_WINDOW // 2
-        if not keep[border:-border, border:-border].any():
+        if not keep.any():
             return None
         # A network sees whole pictures: where nothing is known, the photograph stands.
         rendered = torch.where(keep[..., None], rendered, photograph)
@@ -357,6 +355,18 @@ def _view_score(
         ssim=ssim(rendered, photograph, keep),
         lpips=None if lpips is None else lpips(rendered, photograph),
     )
+
+
+def scored_pixels(
+    view: View, *, masks: MaskUse, longest: int | None
+) -> Bool[Tensor, "height width"] | None:
+    """Which pixels of a view are scored: None is all, and none is where SSIM would have none."""
+    mask = load_mask(view, longest=longest) if masks == "ignore" else None
+    if mask is None:
+        return None
+    border = SSIM_WINDOW // 2
+    inner = mask[border:-border, border:-border] > 0
+    return mask > 0 if inner.any() else torch.zeros_like(mask, dtype=torch.bool)
 
 
 @boundary

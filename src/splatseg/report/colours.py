@@ -11,7 +11,6 @@ from PIL import Image, ImageDraw, ImageFont
 from scipy import ndimage, sparse
 from torch import Tensor
 
-from splatseg._check import check_shape
 from splatseg.core import UNLABELLED, ClassInfo, ClassTable, Gaussians, Labels, RenderableLayer
 
 Colour = tuple[int, int, int]
@@ -42,7 +41,6 @@ def colour_labels(
     ids: Int[Tensor, "height width"], classes: ClassTable | None = None
 ) -> UInt8[Tensor, "height width 3"]:
     """A label map in colours, see `colour_of`."""
-    check_shape("ids", ids, (None, None))
     present, index = torch.unique(ids, return_inverse=True)
     colours = [colour_of(id, classes) for id in present.tolist()]
     return torch.tensor(colours, dtype=torch.uint8)[index]
@@ -232,7 +230,6 @@ def draw_ids(
     image: UInt8[Tensor, "height width 3"], ids: Int[Tensor, "height width"]
 ) -> UInt8[Tensor, "height width 3"]:
     """A picture with the ids of a label map written on it; too small areas go without."""
-    check_shape("ids", ids, image.shape[:2])
     size = max(_SMALLEST, round(_SHARE * max(image.shape[:2])))
     picture = Image.fromarray(image.cpu().numpy())
     draw, font = ImageDraw.Draw(picture), ImageFont.load_default(size)

@@ -23,13 +23,7 @@ from splatseg.io.scene import load_scene, load_scene_layer
 from splatseg.lift import label_map
 from splatseg.report.colours import colour_labels, draw_ids, layer_colours
 from splatseg.report.html import Bars, Commands, Figure, Legend, Report, Table, report_html
-from splatseg.report.images import (
-    Gallery,
-    GalleryImage,
-    colour_depth,
-    contact_sheet,
-    mark_errors,
-)
+from splatseg.report.images import Gallery, GalleryImage, colour_depth, contact_sheet, mark_errors
 from splatseg.report.words import count_text, counted, environment, spread
 
 _HELD_OUT_ROWS = 6
@@ -66,13 +60,8 @@ class DemoFigures:
 def machine_score(capture: Path, evidence: str) -> SemanticScore:
     """Score the recorded labels of a capture in the views that have them, pooled."""
     labels, truth = open_evidence(capture / evidence), open_evidence(capture / "semantic")
-    total: Confusion | None = None
-    for name in labels.view_names:
-        one = Confusion.of(labels.label_map(name).ids, truth.label_map(name).ids)
-        total = one if total is None else total + one
-    if total is None:
-        raise InputError(f"{capture / evidence}: expected label maps, got none.")
-    return semantic_score(total)
+    pairs = ((labels.label_map(name).ids, truth.label_map(name).ids) for name in labels.view_names)
+    return semantic_score(sum((Confusion.of(*pair) for pair in pairs), Confusion.none()))
 
 
 def write_report(

@@ -117,7 +117,6 @@ def colour_depth(
         near: Depth that is shown lightest; None is the nearest hundredth of the map.
         far: Depth that is shown darkest; None is the farthest hundredth.
     """
-    check_shape("depth", depth, (None, None))
     known = depth > 0
     values = depth[known].double()
     if not len(values):
@@ -141,7 +140,6 @@ def overlay_labels(
 
     Pixels without a label keep their colours.
     """
-    check_shape("ids", ids, image.shape[:2])
     tinted = 0.45 * image.double() + 0.55 * colour_labels(ids, classes).double()
     out = torch.where((ids < 0).unsqueeze(-1), image.double(), tinted)
     edge = torch.zeros(ids.shape, dtype=torch.bool)
@@ -157,7 +155,6 @@ def colour_share(
 
     Nearly black where they are negative: nothing is there.
     """
-    check_shape("values", values, (None, None))
     stretched = (values.double() - low) / max(high - low, 1e-9)
     mixed = _ramp(stretched.clamp(0, 1)).round()
     nothing = torch.tensor(NOTHING, dtype=torch.float64)
@@ -168,7 +165,6 @@ def colour_difference(
     one: UInt8[Tensor, "height width 3"], other: UInt8[Tensor, "height width 3"]
 ) -> UInt8[Tensor, "height width 3"]:
     """How far two images differ in each channel, times four: black where they agree."""
-    check_shape("other", other, one.shape)
     return (4 * (one.int() - other.int()).abs()).clamp(max=255).to(torch.uint8)
 
 
@@ -182,8 +178,6 @@ def mark_errors(
 
     Pixels whose truth is not known (-1) stay grey.
     """
-    check_shape("ids", ids, image.shape[:2])
-    check_shape("truth", truth, image.shape[:2])
     grey = image.double().mean(dim=-1, keepdim=True).expand(*image.shape) * 0.75 + 50
     wrong = (ids != truth) & (truth >= 0)
     out = torch.where(wrong.unsqueeze(-1), 0.25 * grey + 0.75 * torch.tensor(_WRONG).double(), grey)
@@ -328,11 +322,7 @@ def selection_picture(
         polygons: Boxes and lassos, corners in pixels.
         strokes: Pixels of strokes on the thing.
         negative_strokes: Pixels of strokes beside it.
-
-    Raises:
-        ShapeError: If the mask has not the image's size.
     """
-    check_shape("mask", mask, tuple(image.shape[:2]))
     lit = np.where(mask.numpy()[..., None], 1.0, _DIMMED)
     colours = (image.numpy() * lit + 0.5).astype(np.uint8)
     for pixels, colour in ((strokes, _POSITIVE), (negative_strokes, _NEGATIVE)):

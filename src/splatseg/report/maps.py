@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 from torch import Tensor
 
-from splatseg._check import check_shape
 from splatseg.core import ClassTable, Gaussians, View
 from splatseg.report.colours import Colour, colour_of
 from splatseg.report.images import Gallery, GalleryImage
@@ -52,9 +51,7 @@ class LabelledPoints:
 
         Without `truth` no point of the scan has one.
         """
-        check_shape("ids", ids, (len(points),))
         true = torch.full((len(points),), -1, dtype=torch.int32) if truth is None else truth
-        check_shape("truth", true, (len(points),))
         rows = torch.arange(self._seen, self._seen + len(points))
         self._seen += len(points)
         kept = rows % self._step == 0
@@ -101,8 +98,6 @@ def point_map(
         colours: Of the ids.
         up: Away from the ground, of any length but 0.
     """
-    check_shape("points", points, (None, 3))
-    check_shape("ids", ids, (len(points),))
     places: NDArray[np.float64] = points.detach().cpu().double().numpy()
     right, deep, above = _ground_axes(places, np.array(up, np.float64))
     flat = np.stack((places @ right, places @ deep), axis=1)

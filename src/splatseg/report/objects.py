@@ -45,7 +45,6 @@ class Sighting:
     """An object in the view that shows it best."""
 
     view: str
-    split: str
     pixels: int
     """How many it has there, at no more than 384 pixels."""
 
@@ -96,7 +95,6 @@ def sightings(
             cut = _cut(photograph, maps[index] == id, best[id].box, colours[id], size)
             found[id] = Sighting(
                 view=view.name,
-                split=view.split,
                 pixels=best[id].pixels,
                 image=GalleryImage(torch.from_numpy(cut)),
             )

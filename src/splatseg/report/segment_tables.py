@@ -7,14 +7,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from splatseg.core import (
-    LOSS_CURVE,
-    UNLABELLED,
-    ClassTable,
-    Labels,
-    LayerInfo,
-    RenderableLayer,
-)
+from splatseg.core import LOSS_CURVE, UNLABELLED, ClassTable, Labels, LayerInfo, RenderableLayer
 from splatseg.evaluate.agreement import SEEN_WEIGHT, contested, rivals
 from splatseg.report.chart import Chart, Line
 from splatseg.report.html import Bars, Block, Cell, Curves, Table
@@ -230,18 +223,13 @@ def id_table(
     instances = labels.info.instances
     known = {"segments": {id: facts.segments for id, facts in instances.items()}}
     known["views"] = {id: facts.views for id, facts in instances.items()}
-    also = [key for key, counts in known.items() if any(n is not None for n in counts.values())]
-    ids, confidence = labels.ids.cpu().long(), labels.confidence.detach().double().cpu()
-    rows: list[tuple[Cell, ...]] = []
-    for row in classes.rows:
-        mask = ids == row.id
-        count = int(mask.sum())
-        mean = float(confidence[mask].mean()) if count else None
-        values: list[Cell] = [row.id, row.name, count, mean]
-        values += [known[key].get(row.id) for key in also]
-        if scores:
-            values.append(scores.get(row.id))
-        rows.append(tuple(values))
+    also = {
+        name: counts
+        for name, counts in known.items()
+        if any(count is not None for count in counts.values())
+    }
+    ids, sure = labels.ids.cpu().long(), labels.confidence.detach().double().cpu()
+    rows = _id_rows(ids, sure, classes, [*also.values(), *([scores] if scores else [])])
     columns = ("id", "name", "Gaussians", "confidence", *also)
     return _largest_first(columns, rows, scored if scores else "")
 
@@ -252,17 +240,23 @@ def seen_id_table(
     """One row an id: how many pixels of the views shown, how sure, how good where it is known."""
     ids = torch.cat([torch.zeros(0), *(panel.drawn.reshape(-1) for panel in panels)]).long()
     sure = torch.cat([torch.zeros(0), *(panel.confidence.reshape(-1) for panel in panels)]).double()
+    rows = _id_rows(ids, sure, classes, [scores] if scores else [])
+    columns = ("id", "name", "pixels of the views shown", "confidence")
+    return _largest_first(columns, rows, scored if scores else "")
+
+
+def _id_rows(
+    ids: Tensor, sure: Tensor, classes: ClassTable, also: Sequence[Mapping[int, Cell]]
+) -> list[tuple[Cell, ...]]:
+    """Id, name, count and mean confidence of each class, and what further tables say of its id."""
     rows: list[tuple[Cell, ...]] = []
     for row in classes.rows:
         mask = ids == row.id
         known = sure[mask & (sure >= 0)]
-        values: list[Cell] = [row.id, row.name, int(mask.sum())]
-        values.append(float(known.mean()) if len(known) else None)
-        if scores:
-            values.append(scores.get(row.id))
-        rows.append(tuple(values))
-    columns = ("id", "name", "pixels of the views shown", "confidence")
-    return _largest_first(columns, rows, scored if scores else "")
+        mean = float(known.mean()) if len(known) else None
+        more = (values.get(row.id) for values in also)
+        rows.append((row.id, row.name, int(mask.sum()), mean, *more))
+    return rows
 
 
 def _largest_first(columns: Sequence[str], rows: list[tuple[Cell, ...]], scored: str) -> Table:

@@ -32,13 +32,7 @@ from splatseg.io.export import node_rows
 from splatseg.io.images import image_camera, load_image, reduced_size
 from splatseg.report.colours import colour_labels, draw_ids, layer_colours
 from splatseg.report.html import Block, Table
-from splatseg.report.images import (
-    Gallery,
-    GalleryImage,
-    colour_share,
-    mark_errors,
-    overlay_labels,
-)
+from splatseg.report.images import Gallery, GalleryImage, colour_share, mark_errors, overlay_labels
 
 _LONGEST = 1024
 """Pixels at which views without a truth are drawn."""

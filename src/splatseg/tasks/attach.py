@@ -14,24 +14,20 @@ from splatseg.core import (
     Layer,
     Scene,
     Similarity,
-    View,
     VoxelFeatures,
     with_info,
 )
 from splatseg.core.boundary import boundary
 from splatseg.core.options import Share
 from splatseg.core.options import options as options_class
+from splatseg.edit.history import moved_view
 from splatseg.errors import InputError
 from splatseg.io.atomic import is_vacant
 from splatseg.io.export import check_parent, column_table_of, label_columns, write_labelled_splats
 from splatseg.io.scene import load_scene, save_scene, save_scene_layer, scene_layer_names
 from splatseg.io.scene_folder import is_scene, work_on_scene
 from splatseg.io.splats import Values, read_scene_splats
-from splatseg.lift import (
-    GaussianMatches,
-    MatchOptions,
-    match_gaussians,
-)
+from splatseg.lift import GaussianMatches, MatchOptions, match_gaussians
 from splatseg.tasks.export_labels import label_tables
 from splatseg.tasks.import_scene import read_with_notes
 from splatseg.tasks.work import SILENT, Observer, Work, versions
@@ -358,17 +354,12 @@ def _moved(scene: Scene, found: GaussianMatches, observer: Observer) -> Scene:
     move = first.edited_from_source
     return replace(
         scene,
-        views=tuple(_moved_view(view, move) for view in scene.views),
+        views=tuple(moved_view(view, move) for view in scene.views),
         up=None if scene.up is None else _turned(scene.up, move),
         metres_per_unit=None
         if scene.metres_per_unit is None
         else scene.metres_per_unit / move.scale,
     )
-
-
-def _moved_view(view: View, move: Similarity) -> View:
-    unit = None if view.depth_unit is None else view.depth_unit * move.scale
-    return replace(view, camera=view.camera.moved(move), depth_unit=unit)
 
 
 def _turned(up: tuple[float, float, float], move: Similarity) -> tuple[float, float, float]:

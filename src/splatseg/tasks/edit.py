@@ -12,30 +12,16 @@ from torch import Tensor
 
 from splatseg.core import Scene, View
 from splatseg.core.boundary import boundary
-from splatseg.edit import (
-    Document,
-    Operation,
-    apply,
-    load_document,
-    prepare,
-    save_document,
-    undo,
-)
+from splatseg.edit import Document, Operation, apply, load_document, prepare, save_document, undo
 from splatseg.edit.document import BASE, HISTORY
 from splatseg.errors import InputError, MissingFileError
-from splatseg.io.images import reduced_size, save_png
+from splatseg.io.images import image_camera, save_png
 from splatseg.io.scene_folder import is_scene
 from splatseg.lift import CutOptions
 from splatseg.render import BackendName, render
 from splatseg.report.html import Figure, Report
 from splatseg.report.images import Gallery, GalleryImage, contact_sheet
-from splatseg.tasks.edit_operations import (
-    Cut,
-    EditOptions,
-    measured_change,
-    operations_of,
-    where_of,
-)
+from splatseg.tasks.edit_operations import EditOptions, measured_change, operations_of, where_of
 from splatseg.tasks.work import REPORTS_FOLDER, SILENT, Observer, Work, check_new_folder, write_page
 
 _ASKED_VIEWS = 24
@@ -46,17 +32,7 @@ _SMALL, _LARGE = 160, 960
 """Longest side in pixels of these and of those that are shown."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class EditPictures:
-    """Views that change most, the first most of all; pictures are 8-bit sRGB."""
-
-    gallery: Gallery
-    views: tuple[str, ...]
-
-
-def draw_edit(
-    before: Scene, after: Scene, *, views: int, backend: BackendName
-) -> EditPictures | None:
+def draw_edit(before: Scene, after: Scene, *, views: int, backend: BackendName) -> Gallery | None:
     """Draw the views that an edit changes most, before and after it.
 
     Views are compared by name, each with the camera that it has in its scene: a scene that was
@@ -75,15 +51,11 @@ def draw_edit(
         first, second = (_small_image(s, view.name, _SMALL, backend) for s in (before, after))
         changes.append(float(((first - second) ** 2).mean()))
     order = sorted(range(len(asked)), key=lambda i: (-changes[i], i))[:views]
-    chosen = [asked[i] for i in order]
-    return EditPictures(
-        gallery=Gallery(
-            title="Before and after",
-            columns=("before", "after"),
-            rows=tuple(_row(before, after, view, backend) for view in chosen),
-            note="The views that change most, the first most of all.",
-        ),
-        views=tuple(view.name for view in chosen),
+    return Gallery(
+        title="Before and after",
+        columns=("before", "after"),
+        rows=tuple(_row(before, after, asked[i], backend) for i in order),
+        note="The views that change most, the first most of all.",
     )
 
 
@@ -101,15 +73,12 @@ def _row(
 
 
 def _small_image(scene: Scene, name: str, longest: int, backend: BackendName) -> Tensor:
-    camera = scene.view(name).camera
-    size = reduced_size(camera.width, camera.height, longest)
-    if size != (camera.width, camera.height):
-        camera = camera.resized(*size)
+    camera = image_camera(scene.view(name), longest)
     return render(scene.gaussians, camera, backend=backend).image.clamp(0, 1).cpu()
 
 
 def write_edit_report(
-    pictures: EditPictures,
+    pictures: Gallery,
     folder: Path,
     *,
     counts: tuple[int, int],
@@ -125,23 +94,18 @@ def write_edit_report(
     """
     folder.mkdir(exist_ok=True)
     before, after = counts
-    sentences = [edit_sentence(operation) for operation in operations]
     figures = (
         Figure(value=f"{before}", label="Gaussians before"),
         Figure(value=f"{after}", label="Gaussians after", note=f"{after - before:+}"),
     )
-    page = Report(
-        title="Edit",
-        summary=" ".join(sentences),
-        figures=figures,
-        blocks=(pictures.gallery,),
-    )
-    save_png(contact_sheet(pictures.gallery, cell_width=480), folder / "edit.png")
+    summary = " ".join(map(edit_sentence, operations))
+    page = Report(title="Edit", summary=summary, figures=figures, blocks=(pictures,))
+    save_png(contact_sheet(pictures, cell_width=480), folder / "edit.png")
     record = {
         "before": before,
         "after": after,
         "operations": [dict(operation) for operation in operations],
-        "views": list(pictures.views),
+        "views": [name for name, _ in pictures.rows],
     }
     write_page(page, folder / "edit.html", record=record)
 
@@ -208,13 +172,8 @@ def edit_scene(
     if options.undo:
         after, done = _undone(root, document, data, backend, observer)
     else:
-        work = _Work(
-            options=options,
-            cut=Cut(by=options.cut, evidence=options.evidence, options=cut_options or CutOptions()),
-            backend=backend,
-            observer=observer,
-        )
-        after, done = _edited(work, document)
+        cut = cut_options or CutOptions()
+        after, done = _edited(document, options, cut, backend, observer)
     with observer.stage("pictures"):
         pictures = draw_edit(document.scene, after.scene, views=options.pictures, backend=backend)
     saved = save_document(_with_base(root, folder, document, after), folder)
@@ -227,36 +186,30 @@ def edit_scene(
     return EditedScene(folder=folder, document=saved, operations=tuple(done), report=report)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Work:
-    """What is done, and how."""
-
-    options: EditOptions
-    cut: Cut
-    backend: BackendName
-    observer: Observer
-
-
-def _edited(work: _Work, document: Document) -> tuple[Document, list[Mapping[str, Any]]]:
-    options = work.options
-    where = where_of(options, document)
+def _edited(
+    document: Document,
+    options: EditOptions,
+    cut: CutOptions,
+    backend: BackendName,
+    observer: Observer,
+) -> tuple[Document, list[Mapping[str, Any]]]:
     done: list[Mapping[str, Any]] = []
-    operations = operations_of(options, document, where, cut=work.cut, observer=work.observer)
-    for operation in operations:
-        with work.observer.stage(operation.kind) as step:
-            ready = prepare(document, operation, backend=work.backend, progress=step)
+    where = where_of(options, document)
+    for operation in operations_of(options, document, where, cut=cut, observer=observer):
+        with observer.stage(operation.kind) as step:
+            ready = prepare(document, operation, backend=backend, progress=step)
         measured: dict[str, float] = {}
         added = len(ready.document.scene.gaussians) - len(document.scene.gaussians)
         if ready.split:
             if options.pictures:
-                measured = measured_change(document, ready.document, backend=work.backend)
-            work.observer.info(_split_sentence(operation, ready.split, measured))
-            work.observer.info(_growth_sentence(added, len(document.scene.gaussians)))
-        after = apply(document, operation, prepared=ready, backend=work.backend)
+                measured = measured_change(document, ready.document, backend=backend)
+            observer.info(_split_sentence(operation, ready.split, measured))
+            observer.info(_growth_sentence(added, len(document.scene.gaussians)))
+        after = apply(document, operation, prepared=ready, backend=backend)
         count = None if ready.selection is None else ready.selection.count
         if count is not None:
             specks = f", {ready.specks} of them specks" if ready.specks else ""
-            work.observer.info(f"{operation.kind}: {count} Gaussians selected{specks}")
+            observer.info(f"{operation.kind}: {count} Gaussians selected{specks}")
         done.append(
             {
                 "kind": operation.kind,
@@ -304,16 +257,11 @@ def _with_result(document: Document, measured: Mapping[str, float]) -> Document:
 
 def _with_base(root: Path, folder: Path, before: Document, after: Document) -> Document:
     """The document with where the scene was before its first edit."""
-    provenance = dict(after.scene.provenance)
-    found = before.scene.provenance.get(BASE)
-    place = root.resolve()
-    if isinstance(found, Mapping):
-        place = _base_of(root, before)
-    start = folder.resolve()
-    provenance[BASE] = {
-        "relative": Path(os.path.relpath(place, start)).as_posix(),
-        "absolute": place.as_posix(),
-    }
+    edited = isinstance(before.scene.provenance.get(BASE), Mapping)
+    place = _base_of(root, before) if edited else root.resolve()
+    relative = Path(os.path.relpath(place, folder.resolve())).as_posix()
+    base = {"relative": relative, "absolute": place.as_posix()}
+    provenance = dict(after.scene.provenance) | {BASE: base}
     return replace(after, scene=replace(after.scene, provenance=provenance))
 
 

@@ -3,25 +3,15 @@
 import math
 import os
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
 
-from splatseg.core import (
-    Labels,
-    LayerInfo,
-    Similarity,
-)
+from splatseg.core import Labels, LayerInfo, Similarity
 from splatseg.core.options import Natural
 from splatseg.core.options import options as options_class
-from splatseg.edit import (
-    CutBy,
-    Document,
-    Operation,
-    Recolour,
-)
+from splatseg.edit import CutBy, Document, Operation, Recolour
 from splatseg.errors import InputError, MissingFileError
 from splatseg.evaluate import psnr, render_and_photograph
 from splatseg.io.evidence import find_evidence, open_evidence
@@ -205,48 +195,40 @@ _DRAWN_VIEWS = 40
 """Most views in which a layer draws its own boundary."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Cut:
-    """What was asked for."""
-
-    by: Literal["auto", "masks", "layer", "box", "off"]
-    evidence: str | None
-    """Name of label maps; None takes those that the layer was made from."""
-
-    options: CutOptions
-
-
-def cut_of(document: Document, where: Where, cut: Cut, observer: Observer) -> CutBy | None:
+def cut_of(
+    document: Document, where: Where, options: EditOptions, cut: CutOptions, observer: Observer
+) -> CutBy | None:
     """How the boundary of what is selected is found, or None where nothing is split."""
-    if cut.by == "off":
+    by = options.cut
+    if by == "off":
         return None
-    if cut.by == "box" or where.layer is None:
-        if where.box is None and cut.by == "auto":
+    if by == "box" or where.layer is None:
+        if where.box is None and by == "auto":
             return None
         if where.box is None:
-            needed = "`box`" if cut.by == "box" else "`layer`"
-            raise InputError(f"cut: {cut.by} goes with {needed}, which was not given.")
-        return CutBy(by="box", options=cut.options)
-    if cut.by == "masks":
-        return _mask_cut(document, where, cut)
+            needed = "`box`" if by == "box" else "`layer`"
+            raise InputError(f"cut: {by} goes with {needed}, which was not given.")
+        return CutBy(by="box", options=cut)
+    if by == "masks":
+        return _mask_cut(document, where, options.evidence, cut)
     layer = document.layers.get(where.layer)
-    if cut.by == "auto" and not document.history and layer is not None:
+    if by == "auto" and not document.history and layer is not None:
         with suppress(InputError):
             if keeps_boundaries(layer.info.method):
-                return _mask_cut(document, where, cut)
+                return _mask_cut(document, where, options.evidence, cut)
     views = document.scene.train_views or document.scene.views
     if not views:
         observer.note("not cut: the scene has no views to see a boundary in")
         return None
     every = math.ceil(len(views) / _DRAWN_VIEWS)
-    return CutBy(by="layer", views=tuple(view.name for view in views[::every]), options=cut.options)
+    return CutBy(by="layer", views=tuple(view.name for view in views[::every]), options=cut)
 
 
-def _mask_cut(document: Document, where: Where, cut: Cut) -> CutBy:
+def _mask_cut(document: Document, where: Where, named: str | None, cut: CutOptions) -> CutBy:
     """At the label maps that a layer was made from."""
     layer = document.layers.get(where.layer or "")
     info = LayerInfo() if layer is None else layer.info
-    name = cut.evidence or info.evidence
+    name = named or info.evidence
     if not where.ids or name is None:
         raise InputError("cut: masks needs a layer made from label maps, got none.")
     zero_is_class = info.source_ids is not None
@@ -257,13 +239,7 @@ def _mask_cut(document: Document, where: Where, cut: Cut) -> CutBy:
     views = tuple(view.name for view in views_that_made(document.scene, info, evidence))
     if not views:
         raise InputError(f"cut: masks: {name} has no label map of a view that may be used.")
-    return CutBy(
-        by="masks",
-        evidence=name,
-        zero_is_class=zero_is_class,
-        views=views,
-        options=cut.options,
-    )
+    return CutBy(by="masks", evidence=name, zero_is_class=zero_is_class, views=views, options=cut)
 
 
 def measured_change(before: Document, split: Document, *, backend: BackendName) -> dict[str, float]:
@@ -326,7 +302,7 @@ def operations_of(
     document: Document,
     where: Where | None,
     *,
-    cut: Cut,
+    cut: CutOptions,
     observer: Observer,
 ) -> tuple[Operation, ...]:
     """What the options ask for, in the order in which it is done.
@@ -349,7 +325,7 @@ def operations_of(
             raise MissingFileError(f"{options.merge}: expected a scene folder, got none.")
         absolute = options.merge.resolve().as_posix()
         return (Operation(kind="merge", other=absolute, transform=moved),)
-    split_by = None if where is None else cut_of(document, where, cut, observer)
+    split_by = None if where is None else cut_of(document, where, options, cut, observer)
     found: list[Operation] = []
     if options.extract or options.remove:
         kind: Literal["extract", "remove"] = "extract" if options.extract else "remove"

@@ -41,6 +41,7 @@ from splatseg.report.colours import colour_of, layer_colours, names_of
 from splatseg.tasks.work import Work
 
 What = Literal["splat", "objects", "points", "coco", "table"]
+_Kind = Literal["class", "instance"]
 
 
 @options
@@ -154,17 +155,14 @@ class ExportJob:
         """The layers as columns of a file, by name, and what these mean."""
         columns: dict[str, Tensor] = {}
         meaning: dict[str, Any] = {}
-        layers: tuple[
-            tuple[Literal["class", "instance"], str | None, Labels | Selection | None], ...
-        ]
-        layers = (
+        table = self.work.scene.classes
+        layers: tuple[tuple[_Kind, str | None, Labels | Selection | None], ...] = (
             ("class", self.options.layer, self.layer),
             ("instance", self.options.instances, self.instances),
         )
         for kind, name, layer in layers:
             if layer is not None and name is not None:
                 columns |= label_columns(layer, kind)
-                table = self.work.scene.classes
                 meaning |= label_tables(layer, kind, name, table, gaussians=self.gaussians)
         return columns, meaning
 
@@ -270,7 +268,7 @@ def _within(labels: Labels, keep: Tensor) -> Labels:
 
 def label_tables(
     layer: Labels | Selection,
-    kind: Literal["class", "instance"],
+    kind: _Kind,
     name: str,
     classes: ClassTable | None,
     *,

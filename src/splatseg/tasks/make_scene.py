@@ -40,12 +40,7 @@ from splatseg.tasks.moving import (
     moving_things,
     without_moving_points,
 )
-from splatseg.tasks.photographs import (
-    MakeSceneOptions,
-    capture_of,
-    with_depth_evidence,
-    with_scans,
-)
+from splatseg.tasks.photographs import MakeSceneOptions, capture_of, with_depth_evidence, with_scans
 from splatseg.tasks.work import (
     REPORTS_FOLDER,
     SILENT,
@@ -152,7 +147,7 @@ def fit_capture(
         # What was done before a fit was resumed counts as optimisation.
         timings["optimisation"] = result.seconds
         timings["scene written"] = max(0.0, time.monotonic() - began - result.seconds)
-        done = score_and_report(
+        told, report = score_and_report(
             folder,
             capture,
             result,
@@ -166,20 +161,21 @@ def fit_capture(
         # Not before the report: who is stopped there can resume, and gets it.
         if not (stopped or options.keep_checkpoint):
             discard_checkpoint_file(folder / CHECKPOINT_FILE)
-    if done.verdict.warns:
-        observer.note(f"{done.verdict.words.lower()}: {done.verdict.sentence.rstrip('.')}")
+    verdict = verdict_of(told)
+    if verdict.warns:
+        observer.note(f"{verdict.words.lower()}: {verdict.sentence.rstrip('.')}")
     return MadeScene(
         folder=folder,
         capture=capture,
         result=result,
         interrupted=stopped,
-        scores=done.scores,
-        held_out=sum(view.image is not None for view in capture.test_views),
-        report=done.report,
+        scores=told.scores,
+        held_out=told.held_out,
+        report=report,
         poses=poses,
         moving=moving,
-        verdict=done.verdict,
-        timings=done.timings,
+        verdict=verdict,
+        timings=told.timings,
     )
 
 
@@ -318,19 +314,6 @@ _NEXT = ("worst", "second worst", "third worst")
 _SCORING = 20.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FittedScene:
-    """What is known of a fit once it was scored and told."""
-
-    scores: PhotographReport | None
-    """None where no view was scored."""
-
-    report: Path
-    verdict: FitVerdict
-    timings: Mapping[str, float]
-    """Seconds by part of the command."""
-
-
 def score_and_report(
     root: Path,
     capture: Capture,
@@ -342,7 +325,7 @@ def score_and_report(
     command: str = "",
     timings: Mapping[str, float] | None = None,
     poses: Mapping[str, Any] | None = None,
-) -> FittedScene:
+) -> tuple[FitReportData, Path]:
     """Score the held-out views, write SCENE/reports/fit.html and fit.json.
 
     As many views are scored as the time for it allows; with `scoring` False none is, for who
@@ -358,6 +341,9 @@ def score_and_report(
         command: The words that started it; may be empty.
         timings: Seconds by part of the command until now.
         poses: How cameras were found; None takes what is kept with the scene.
+
+    Returns:
+        What the page tells, and where it is.
     """
     began = time.monotonic()
     views = [view for view in capture.test_views if view.image is not None]
@@ -387,8 +373,8 @@ def score_and_report(
     spent = {**(timings or {}), "scores and report": time.monotonic() - began}
     data = replace(data, timings=spent)
     page = fit_report(data, pairs=pairs, cameras=cameras)
-    where = write_page(page, scene_path(root, REPORTS_FOLDER, "fit.html"), record=fit_record(data))
-    return FittedScene(scores=scores, report=where, verdict=verdict_of(data), timings=spent)
+    path = scene_path(root, REPORTS_FOLDER, "fit.html")
+    return data, write_page(page, path, record=fit_record(data))
 
 
 def _pairs(

@@ -7,34 +7,18 @@ from typing import Literal
 
 import torch
 
-from splatseg.core import (
-    Capture,
-    DepthMap,
-    PointCloud,
-    ScanSource,
-    View,
-)
+from splatseg.core import Capture, DepthMap, PointCloud, ScanSource, View
 from splatseg.core.boundary import boundary
 from splatseg.core.models import PointmapModel
 from splatseg.core.options import Count
 from splatseg.core.options import options as options_class
 from splatseg.errors import InputError, MissingFileError
-from splatseg.fit import (
-    DepthPoints,
-    scan_depths,
-)
+from splatseg.fit import DepthPoints, scan_depths
 from splatseg.io.atomic import check_utf8, is_vacant
 from splatseg.io.captures import find_formats, read_capture
-from splatseg.io.evidence import (
-    DepthEvidence,
-    find_evidence,
-    open_evidence,
-    save_depth_map,
-)
+from splatseg.io.evidence import DepthEvidence, find_evidence, open_evidence, save_depth_map
 from splatseg.io.pointmaps import HEADER_FILE, RecordedPointmaps, holds_pointmaps, open_pointmaps
-from splatseg.io.scene_folder import (
-    POSES_FOLDER,
-)
+from splatseg.io.scene_folder import POSES_FOLDER
 from splatseg.models import model_names
 from splatseg.pose import (
     PoseOptions,
@@ -225,12 +209,7 @@ def _without_poses(data: Path, format: str, poses: Poses) -> bool:
 def _sentences(data: Path, folder: Path, result: PoseResult) -> list[str]:
     """What was placed, how well, by whom, and what was left out and why."""
     report = result.report
-    lines = [_placed(data, report)]
-    if result.reused:
-        lines.append(f"(as found before; remove {folder} to begin again)")
-    else:
-        stages = ", ".join(f"{stage} {seconds:.0f}" for stage, seconds in report.seconds.items())
-        lines.append(f"poses took {sum(report.seconds.values()):.0f} s ({stages})")
+    lines = [_placed(data, report), _how_long(folder, result)]
     lines += [
         f"the {attempt.mapper} mapper placed {attempt.registered} ({attempt.error:.2f} px)"
         for attempt in report.tries
@@ -246,6 +225,14 @@ def _sentences(data: Path, folder: Path, result: PoseResult) -> list[str]:
     if more > 0:
         lines.append(f"left out {more} more; {folder / 'poses.json'} names them")
     return lines
+
+
+def _how_long(folder: Path, result: PoseResult | PointmapResult) -> str:
+    if result.reused:
+        return f"(as found before; remove {folder} to begin again)"
+    seconds = result.report.seconds
+    stages = ", ".join(f"{stage} {spent:.0f}" for stage, spent in seconds.items())
+    return f"poses took {sum(seconds.values()):.0f} s ({stages})"
 
 
 def _placed(data: Path, report: PoseReport) -> str:
@@ -333,13 +320,9 @@ def _pointmap_sentences(data: Path, folder: Path, result: PointmapResult) -> lis
     lines = [
         f"{data}: {report.photographs} photographs placed by {report.pairs} pairs of pointmaps "
         f"({report.model}), which differ by {100 * report.residual:.1f} % of the depth; "
-        f"{report.points} points"
+        f"{report.points} points",
+        _how_long(folder, result),
     ]
-    if result.reused:
-        lines.append(f"(as found before; remove {folder} to begin again)")
-    else:
-        stages = ", ".join(f"{stage} {seconds:.0f}" for stage, seconds in report.seconds.items())
-        lines.append(f"poses took {sum(report.seconds.values()):.0f} s ({stages})")
     focals = sorted(report.focals.values())
     low, high = focals[0], focals[-1]
     lines.append(

@@ -1,7 +1,6 @@
 """Pictures and files of selections and of answers to words, and the page of a query."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -9,13 +8,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from splatseg.core import (
-    UNLABELLED,
-    Labels,
-    Scene,
-    Selection,
-    View,
-)
+from splatseg.core import UNLABELLED, Labels, Scene, Selection, View
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, MissingFileError
 from splatseg.io.atomic import path_inside
@@ -181,9 +174,10 @@ def draw_answers(
     files: list[Path] = []
     for word in answers.words:
         for rank, thing in enumerate(answers.found[word][:top], start=1):
-            shown = best_view(scene, views, answers.of_thing(word, thing.thing), backend=backend)
+            chosen = answers.of_thing(word, thing.thing)
+            _, image, mask = best_view(scene, views, chosen, backend=backend)
             path = path_inside(folder, f"{file_name(word)}_{rank}.png")
-            save_png(selection_picture(shown.image, shown.mask), path)
+            save_png(selection_picture(image, mask), path)
             files.append(path)
     return tuple(files)
 
@@ -260,19 +254,10 @@ def file_name(word: str) -> str:
     return "".join(one if one.isalnum() else "_" for one in word)[:60]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class SeenThing:
-    """A thing in a view."""
-
-    view: View
-    mask: Bool[Tensor, "height width"]
-    image: UInt8[Tensor, "height width 3"]
-
-
 def best_view(
     scene: Scene, views: Sequence[View], chosen: Selection, *, backend: BackendName
-) -> SeenThing:
-    """A thing in the view that shows most of it.
+) -> tuple[View, UInt8[Tensor, "height width 3"], Bool[Tensor, "height width"]]:
+    """The view that shows most of a thing, its image, and the mask of the thing there.
 
     Args:
         scene: The scene.
@@ -287,8 +272,7 @@ def best_view(
             seen.append((view, view_label_map(prepared, labels).ids.cpu() == _SELECTED))
     view, mask = max(seen, key=lambda one: int(one[1].sum()))
     with prepare(scene.gaussians, view.camera, backend=backend) as prepared:
-        image = shown_image(view, prepared)
-    return SeenThing(view=view, mask=mask, image=image)
+        return view, shown_image(view, prepared), mask
 
 
 def views_near(scene: Scene, views: Sequence[View], chosen: Selection) -> tuple[View, ...]:
@@ -410,13 +394,11 @@ def _where(
     rows: list[tuple[str, tuple[GalleryImage, ...]]] = []
     for word in words:
         thing = answers.of_thing(word, answers.found[word][0].thing)
-        seen = best_view(scene, views, thing, backend=backend)
-        with prepare(scene.gaussians, seen.view.camera, backend=backend) as prepared:
+        view, image, mask = best_view(scene, views, thing, backend=backend)
+        with prepare(scene.gaussians, view.camera, backend=backend) as prepared:
             heat = heat_of(answers, prepared)[..., answers.words.index(word)]
-        pictures = (selection_picture(seen.image, seen.mask), heat_picture(seen.image, heat))
-        rows.append(
-            (word, tuple(GalleryImage(image=one, caption=seen.view.name) for one in pictures))
-        )
+        pictures = (selection_picture(image, mask), heat_picture(image, heat))
+        rows.append((word, tuple(GalleryImage(image=one, caption=view.name) for one in pictures)))
     return Gallery(
         title="Where they are",
         columns=("the surest thing", "probability"),

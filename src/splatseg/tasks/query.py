@@ -9,15 +9,7 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from splatseg.core import (
-    UNLABELLED,
-    Labels,
-    Layer,
-    LayerInfo,
-    Scene,
-    Selection,
-    VoxelFeatures,
-)
+from splatseg.core import UNLABELLED, Labels, Layer, LayerInfo, Scene, Selection, VoxelFeatures
 from splatseg.core.boundary import boundary
 from splatseg.core.models import TextFeatures
 from splatseg.errors import InputError
@@ -219,7 +211,7 @@ class QuerySession:
             )
         features, vocabulary = self._source.features, self._source.vocabulary
         components = self._options.components
-        self._places: Mapping[int, _Place] | None = None
+        self._places: Mapping[int, dict[str, Any]] | None = None
         self._index: WordIndex | VoxelWords
         if isinstance(features, VoxelFeatures):
             self._index = VoxelWords(
@@ -335,39 +327,25 @@ class QuerySession:
                 thing=thing,
                 probability=round(float(probabilities[which].double().mean()), 6),
                 cosine=round(float(cosines[which].double().mean()), 6),
-                gaussians=places[thing].gaussians,
-                centre=places[thing].centre,
-                size=places[thing].size,
+                **places[thing],
             )
             for thing, which in rows.items()
         ]
         return tuple(sorted(found, key=_rank))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Place:
-    """Where a thing is, see `Found`."""
-
-    gaussians: int
-    centre: tuple[float, float, float]
-    size: tuple[float, float, float]
-
-
-def _places(scene: Scene, things: Int64[Tensor, "n"]) -> dict[int, _Place]:
-    """Of each thing, by its number; -1 is none."""
+def _places(scene: Scene, things: Int64[Tensor, "n"]) -> dict[int, dict[str, Any]]:
+    """What `Found` says of where each thing is, by its number; -1 is none."""
     inside = torch.nonzero(things >= 0).squeeze(1)
     inside = inside[torch.argsort(things[inside], stable=True)]
     ids, counts = torch.unique_consecutive(things[inside], return_counts=True)
     means = scene.gaussians.means.detach().cpu()
-    found: dict[int, _Place] = {}
+    found: dict[int, dict[str, Any]] = {}
     for thing, rows in zip(ids.tolist(), inside.split(counts.tolist()), strict=True):
         at = means[rows].double()
         span = at.quantile(torch.tensor([0.02, 0.98]).double(), dim=0)
-        found[int(thing)] = _Place(
-            gaussians=len(rows),
-            centre=_triple(at.median(dim=0).values),
-            size=_triple(span[1] - span[0]),
-        )
+        centre, size = _triple(at.median(dim=0).values), _triple(span[1] - span[0])
+        found[int(thing)] = {"gaussians": len(rows), "centre": centre, "size": size}
     return found
 
 

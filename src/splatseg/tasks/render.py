@@ -54,18 +54,11 @@ _NEAR, _FAR = 0.01, 0.99
 
 def write_path(views: Sequence[View], folder: Path, *, pictures: bool) -> None:
     """The cameras of a path as nerfstudio's transforms.json, with the pictures if there are."""
-    shown = [
-        View(
-            name=view.name,
-            camera=view.camera,
-            split=view.split,
-            image=folder.absolute() / "rgb" / f"{view.name}.png" if pictures else None,
-        )
-        for view in views
-    ]
-    write_json(
-        cameras_content(shown, folder=folder.absolute(), source=None), folder / "transforms.json"
-    )
+    if pictures:
+        rgb = folder.absolute() / "rgb"
+        views = [replace(view, image=rgb / f"{view.name}.png") for view in views]
+    content = cameras_content(views, folder=folder.absolute(), source=None)
+    write_json(content, folder / _CAMERAS)
 
 
 def check_film(views: Sequence[View], *, fps: float) -> None:

@@ -9,12 +9,7 @@ from splatseg.core import Labels, Layer, PointLabels, Renderable, Scan, ScanSour
 from splatseg.core.boundary import boundary
 from splatseg.core.options import options as options_class
 from splatseg.errors import InputError
-from splatseg.io.export import (
-    ScanLabelCounts,
-    ScanLabelForm,
-    check_replaceable,
-    write_scan_labels,
-)
+from splatseg.io.export import ScanLabelCounts, ScanLabelForm, check_replaceable, write_scan_labels
 from splatseg.io.scans import Scans, read_scans
 from splatseg.lift.viewed_points import ViewedPointOptions, ViewedPoints
 from splatseg.render import BackendName
@@ -137,7 +132,7 @@ def label_scans(
     rule = _vertex_rule(field, layer)
     with observer.stage("label scans") as step:
         counts = write_scan_labels(
-            _tapped(_labelled(field, scans, layer, step), seen),
+            _labelled(field, scans, layer, step, seen),
             folder,
             form=form,
             array_shape=scans.array_shape if form == "npz" else None,
@@ -161,16 +156,6 @@ def _vertex_rule(field: Renderable, layer: str) -> str | None:
     return None
 
 
-def _tapped(
-    found: Iterator[tuple[Scan, PointLabels]], seen: Callable[[Scan, PointLabels], None] | None
-) -> Iterator[tuple[Scan, PointLabels]]:
-    """The same scans, of which someone else hears too."""
-    for scan, labels in found:
-        if seen is not None:
-            seen(scan, labels)
-        yield scan, labels
-
-
 class _Kept:
     """Scans of which the last that was read is kept: its labels are written in its order."""
 
@@ -189,19 +174,25 @@ class _Kept:
 
 
 def _labelled(
-    field: Renderable, scans: Scans, layer: str, step: Callable[[int, int], None]
+    field: Renderable,
+    scans: Scans,
+    layer: str,
+    step: Callable[[int, int], None],
+    seen: Callable[[Scan, PointLabels], None] | None,
 ) -> Iterator[tuple[Scan, PointLabels]]:
-    """Scans with their labels, in their order."""
+    """Scans with their labels, in their order; `seen` is given them, too."""
     kept = _Kept(scans)
     names = kept.scan_names
-    if isinstance(field, ScanLabeller):
-        for done, (name, labels) in enumerate(field.labels_of_scans(kept, layer), start=1):
-            yield kept.scan(name), labels
-            step(done, len(names))
-        return
-    for done, name in enumerate(names, start=1):
+    found = (
+        field.labels_of_scans(kept, layer)
+        if isinstance(field, ScanLabeller)
+        else ((name, field.labels_at(kept.scan(name).points, layer)) for name in names)
+    )
+    for done, (name, labels) in enumerate(found, start=1):
         scan = kept.scan(name)
-        yield scan, field.labels_at(scan.points, layer)
+        if seen is not None:
+            seen(scan, labels)
+        yield scan, labels
         step(done, len(names))
 
 

@@ -23,19 +23,13 @@ from splatseg.edit import Document, save_document
 from splatseg.edit.document import BASE, HISTORY
 from splatseg.errors import InputError
 from splatseg.io.arrays import discard_checkpoint_file
-from splatseg.io.evidence import (
-    Evidence,
-)
+from splatseg.io.evidence import Evidence
 from splatseg.io.scene import check_name, save_scene_layer
 from splatseg.lift.completion import CompletionOptions, complete
 from splatseg.lift.panoptic import merge_panoptic
 from splatseg.methods import Method, MethodInputs, Refined, find_method
 from splatseg.render import BackendName
-from splatseg.tasks.checkpoints import (
-    CheckpointOptions,
-    training_checkpoints,
-    with_resume_hint,
-)
+from splatseg.tasks.checkpoints import CheckpointOptions, training_checkpoints, with_resume_hint
 from splatseg.tasks.segment_inputs import (
     check_fit,
     classes_to_merge,

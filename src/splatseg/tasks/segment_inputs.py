@@ -8,8 +8,8 @@ from typing import Any
 from splatseg.core import ClassTable, Features, Labels, Scene, View
 from splatseg.core.instance_tree import layer_kind
 from splatseg.errors import InputError
-from splatseg.evaluate.metrics import SSIM_WINDOW, psnr
-from splatseg.evaluate.photographs import render_and_photograph
+from splatseg.evaluate.metrics import psnr
+from splatseg.evaluate.photographs import render_and_photograph, scored_pixels
 from splatseg.io.evidence import (
     Evidence,
     TrackedEvidence,
@@ -18,13 +18,12 @@ from splatseg.io.evidence import (
     open_evidence,
     without_masked,
 )
-from splatseg.io.images import load_mask
 from splatseg.methods import ANY_COMPANION, Method
 from splatseg.render import BackendName
 from splatseg.report.fit_report import MIN_PSNR
-from splatseg.report.words import counted
+from splatseg.report.words import counted, spread
 from splatseg.tasks.see import model_for
-from splatseg.tasks.work import Work, mask_use, photographed, spread_views
+from splatseg.tasks.work import Work, mask_use, photographed
 
 _FIT_VIEWS = 5
 _LONGEST = 512
@@ -203,8 +202,8 @@ def fit_quality(scene: Scene, *, backend: BackendName = "auto") -> FitQuality | 
         FileFormatError: If a photograph cannot be read or has not its camera's size.
         InputError: If masks leave nothing to compare.
     """
-    held_out = spread_views(photographed(scene.test_views), _FIT_VIEWS)
-    views = held_out or spread_views(photographed(scene.train_views), _FIT_VIEWS)
+    held_out = spread(photographed(scene.test_views), _FIT_VIEWS)
+    views = held_out or spread(photographed(scene.train_views), _FIT_VIEWS)
     if not views or not len(scene.gaussians):
         return None
     work = Work(scene=scene, backend=backend)
@@ -218,15 +217,9 @@ def fit_quality(scene: Scene, *, backend: BackendName = "auto") -> FitQuality | 
 def _view_psnr(work: Work, view: View) -> float | None:
     """As `evaluate_photographs` scores it; None where its mask keeps nothing."""
     masks = mask_use(work.scene)
-    rendered, photograph = render_and_photograph(work.field(), view, masks=masks, longest=_LONGEST)
-    mask = load_mask(view, longest=_LONGEST) if masks == "ignore" else None
-    if mask is None:
-        return psnr(rendered, photograph)
-    keep = mask > 0
-    border = SSIM_WINDOW // 2
-    if not keep[border:-border, border:-border].any():
-        return None
-    return psnr(rendered, photograph, keep)
+    pictures = render_and_photograph(work.field(), view, masks=masks, longest=_LONGEST)
+    keep = scored_pixels(view, masks=masks, longest=_LONGEST)
+    return None if keep is not None and not keep.any() else psnr(*pictures, keep)
 
 
 def check_fit(work: Work) -> tuple[str, ...]:

@@ -15,17 +15,9 @@ from splatseg.core.models import GroundedMasks, TextFeatures
 from splatseg.core.options import options
 from splatseg.errors import InputError
 from splatseg.io.evidence import Evidence, FeatureEvidence
-from splatseg.methods.prompt import (
-    PromptOptions,
-    PromptSession,
-    PromptSources,
-    selection_of,
-)
+from splatseg.methods.prompt import PromptOptions, PromptSession, PromptSources, selection_of
 from splatseg.prompting.pipeline import SceneIndex, SelectionContext, postprocess
-from splatseg.prompting.prompts import (
-    Solid,
-    ViewPrompt,
-)
+from splatseg.prompting.prompts import Solid, ViewPrompt
 from splatseg.prompting.seen import ViewCache
 from splatseg.render import BackendName
 from splatseg.tasks.select import Selected, check_base, combined, prompt_record, within

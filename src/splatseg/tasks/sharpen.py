@@ -31,12 +31,7 @@ from splatseg.fit import (
     recorded_exposures,
     refinement_options,
 )
-from splatseg.io.evidence import (
-    Evidence,
-    check_map_sizes,
-    find_evidence,
-    open_evidence,
-)
+from splatseg.io.evidence import Evidence, check_map_sizes, find_evidence, open_evidence
 from splatseg.lift import (
     ConfusionOptions,
     EvidenceSegments,

@@ -41,9 +41,7 @@ from splatseg.street.files import (
     open_blocks,
 )
 from splatseg.tasks.moving import LeftOut
-from splatseg.tasks.street_field import (
-    FieldBuilder,
-)
+from splatseg.tasks.street_field import FieldBuilder
 from splatseg.tasks.street_inputs import (
     DEPTHS,
     DriveInputs,

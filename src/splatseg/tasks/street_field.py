@@ -1,7 +1,8 @@
 """Depth of a few views, kept while a field is built from all, to measure its shapes by."""
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from splatseg.io.scene import load_scene, new_field_file, remove_field_folder, s
 from splatseg.io.scene_folder import is_scene, scene_lock
 from splatseg.render import BackendName
 from splatseg.report.street_report import DepthError
+from splatseg.report.words import spread
 from splatseg.street.build import (
     PUBLISHED,
     DnmpOptions,
@@ -47,7 +49,6 @@ from splatseg.tasks.work import (
     check_new_folder,
     layer_versions,
     scene_of_capture,
-    spread_views,
     view_spec,
 )
 
@@ -80,7 +81,7 @@ class KeptDepths:
 
     def __init__(self, depths: Iterable[DepthView], views: Sequence[View]) -> None:
         self._depths = depths
-        self._wanted = spread_views(views, _VIEWS)
+        self._wanted = spread(views, _VIEWS)
         self.samples: list[DepthSample] = []
 
     def __iter__(self) -> Iterator[DepthView]:
@@ -223,7 +224,7 @@ class FieldBuilder:
         cloud = sources.points if near is None else sources.points[near(sources.points)]
         self._took("points", time.monotonic() - began)
         depths = KeptDepths(sources.depths(), views)
-        with _Stages(observer, self._took) as stages:
+        with _stages(observer, self._took) as told:
             made = build_mesh_field(
                 MeshFieldInputs(
                     points=cloud,
@@ -236,7 +237,7 @@ class FieldBuilder:
                 options=self.chosen,
                 layer=self.layer,
                 seed=self.options.seed,
-                progress=stages.told,
+                progress=told,
             )
         left_out = {} if inputs.moving is None else {"moving": inputs.moving.record}
         more = {"sources": sources.said, **left_out, **(details or {})}
@@ -261,40 +262,34 @@ def chosen_options(options: StreetOptions, given: DnmpOptions | None) -> DnmpOpt
     return replace(given, setting="published") if options.published else given
 
 
-class _Stages:
-    """Stages of a build as an observer hears of them, and how long they took."""
+@contextmanager
+def _stages(
+    observer: Observer, took: Callable[[str, float], None]
+) -> Generator[Callable[[str, int, int], None]]:
+    """Tells an observer of the stages of a build, and how long they took."""
+    stack, name, began = ExitStack(), "", time.monotonic()
+    step: Callable[[int, int], None] | None = None
 
-    def __init__(self, observer: Observer, took: Callable[[str, float], None]) -> None:
-        self._observer, self._took = observer, took
-        self._open: Any = None
-        self._step: Callable[[int, int], None] | None = None
-        self._name = ""
-        self._began = 0.0
+    def close() -> None:
+        nonlocal began
+        stack.close()
+        now = time.monotonic()
+        if name:
+            took(name, now - began)
+            began = now
 
-    def __enter__(self) -> "_Stages":
-        self._began = time.monotonic()
-        return self
+    def told(stage: str, done: int, total: int) -> None:
+        nonlocal name, step
+        if stage != name:
+            close()
+            name, step = stage, stack.enter_context(observer.stage(stage))
+        if step is not None:
+            step(done, total)
 
-    def __exit__(self, *_: object) -> None:
-        self._close()
-
-    def told(self, stage: str, done: int, total: int) -> None:
-        """A stage has come so far."""
-        if stage != self._name:
-            self._close()
-            self._name = stage
-            self._open = self._observer.stage(stage)
-            self._step = self._open.__enter__()
-        if self._step is not None:
-            self._step(done, total)
-
-    def _close(self) -> None:
-        if self._open is not None:
-            self._open.__exit__(None, None, None)
-            now = time.monotonic()
-            self._took(self._name, now - self._began)
-            self._began = now
-        self._open, self._step = None, None
+    try:
+        yield told
+    finally:
+        close()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -16,12 +16,7 @@ from splatseg.core.options import Positive
 from splatseg.core.options import options as options_class
 from splatseg.errors import InputError
 from splatseg.io.captures import find_formats, read_capture
-from splatseg.io.evidence import (
-    DepthEvidence,
-    Evidence,
-    check_map_sizes,
-    open_evidence,
-)
+from splatseg.io.evidence import DepthEvidence, Evidence, check_map_sizes, open_evidence
 from splatseg.io.images import left_out_pixels
 from splatseg.io.moving import view_times
 from splatseg.io.scans import read_scans

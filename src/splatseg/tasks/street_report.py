@@ -8,15 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from splatseg.core import (
-    UNLABELLED,
-    ClassTable,
-    Renderable,
-    RenderableLayer,
-    Scene,
-    View,
-    map_ids,
-)
+from splatseg.core import UNLABELLED, ClassTable, Renderable, RenderableLayer, Scene, View, map_ids
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError
 from splatseg.evaluate import Confusion, semantic_score
@@ -39,7 +31,7 @@ from splatseg.report.street_report import (
     street_record,
     street_report,
 )
-from splatseg.report.words import count_text
+from splatseg.report.words import count_text, spread
 from splatseg.street.depth_views import capture_views, field_views
 from splatseg.street.field import VERTEX_WORDS
 from splatseg.street.geometry import enclosing
@@ -47,7 +39,7 @@ from splatseg.street.shape_files import load_shapes
 from splatseg.tasks.scan_labels import LabelBy, ScanLabels
 from splatseg.tasks.street_drive import StreetDrive
 from splatseg.tasks.street_field import StreetField, depth_errors
-from splatseg.tasks.work import REPORTS_FOLDER, photographed, spread_views, write_page
+from splatseg.tasks.work import REPORTS_FOLDER, photographed, write_page
 
 _VIEWS = 4
 _LONGEST = 720
@@ -183,7 +175,7 @@ def _views(
     known = photographed(scene.train_views)
     rows: list[tuple[str, tuple[GalleryImage, ...]]] = []
     likeness: dict[str, float] = {}
-    for view in spread_views(known, _VIEWS):
+    for view in spread(known, _VIEWS):
         pictures, decibels = _pictures(view, field, layer, classes)
         likeness[view.name] = decibels
         rows.append((view.name, pictures))

@@ -20,12 +20,7 @@ from splatseg.tasks.scan_labels import (
     viewed_points,
 )
 from splatseg.tasks.street_drive import StreetDrive, check_field_name, is_stopped, street_drive
-from splatseg.tasks.street_field import (
-    StreetField,
-    chosen_options,
-    save_street_field,
-    street_field,
-)
+from splatseg.tasks.street_field import StreetField, chosen_options, save_street_field, street_field
 from splatseg.tasks.street_inputs import StreetOptions
 from splatseg.tasks.street_report import LabelledScans, report_street
 from splatseg.tasks.work import SILENT, Observer, Work, scene_field

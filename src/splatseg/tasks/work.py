@@ -31,7 +31,7 @@ from splatseg.io.evidence import Evidence, evidence_names, find_evidence, open_e
 from splatseg.io.json_files import write_json
 from splatseg.io.scene import load_scene_layer, scene_field_path, scene_layer_names
 from splatseg.io.scene_folder import check_unlocked, is_scene, is_unfinished
-from splatseg.lift import GaussianField, PointLabelOptions
+from splatseg.lift import GaussianField
 from splatseg.lift.affinity import KIND
 from splatseg.render import BackendName
 from splatseg.render.paths import camera_path, is_forward_facing
@@ -185,13 +185,11 @@ class Work:
             self._facts[name] = LayerFacts(kind=type(layer), info=layer.info)
         return self._facts[name]
 
-    def field(
-        self, addresses: Iterable[str] = (), *, points: PointLabelOptions | None = None
-    ) -> GaussianField:
-        """The Gaussians with some of the layers, each read once; `points` says how points ask."""
+    def field(self, addresses: Iterable[str] = ()) -> GaussianField:
+        """The Gaussians with some of the layers, each read once."""
         names = dict.fromkeys(address.partition("@")[0] for address in addresses)
         layers = {name: self.layer(name) for name in names}
-        return GaussianField(self.gaussians, layers, backend=self.backend, points=points)
+        return GaussianField(self.gaussians, layers, backend=self.backend)
 
     @property
     def evidence_names(self) -> tuple[str, ...]:
@@ -320,12 +318,6 @@ def views_that_made(scene: Scene, info: LayerInfo, evidence: Evidence) -> tuple[
         for view in scene.views
         if view.name in known and (view.split == "train" if names is None else view.name in names)
     )
-
-
-def spread_views(views: Sequence[View], count: int) -> tuple[View, ...]:
-    """At most `count` views, evenly spread over all."""
-    kept = min(count, len(views))
-    return tuple(views[i * len(views) // kept] for i in range(kept))
 
 
 def photographed(views: Iterable[View]) -> list[View]:

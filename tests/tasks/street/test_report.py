@@ -15,11 +15,12 @@ from splatseg.core import Camera, ClassInfo, ClassTable, LayerInfo, RenderableLa
 from splatseg.errors import InputError
 from splatseg.io.scans import read_scans
 from splatseg.report.maps import LabelledPoints
+from splatseg.report.words import spread
 from splatseg.street.build import DnmpOptions
 from splatseg.street.depth_views import DepthView
 from splatseg.street.field import MeshField
 from splatseg.tasks import ScanLabelOptions, StreetOptions, label_scans, open_drive, street_field
-from splatseg.tasks.street_field import KeptDepths, depth_errors, spread_views
+from splatseg.tasks.street_field import KeptDepths, depth_errors
 from splatseg.tasks.street_report import (
     LabelledScans,
     in_sight,
@@ -215,6 +216,6 @@ def test_errors_are_medians_over_what_rays_meet() -> None:
 
 def test_views_are_spread() -> None:
     views = [View(name=str(i), camera=camera(i)) for i in range(10)]
-    assert [view.name for view in spread_views(views, 4)] == ["0", "2", "5", "7"]
-    assert len(spread_views(views[:2], 4)) == 2
-    assert spread_views([], 4) == ()
+    assert [view.name for view in spread(views, 4)] == ["0", "2", "5", "7"]
+    assert len(spread(views[:2], 4)) == 2
+    assert spread([], 4) == ()
