@@ -34,12 +34,12 @@ from pathlib import Path
 import numpy as np
 import torch
 from splatseg.lift.relevancy import TextSpace
+from splatseg.lift.voxels import TableWords, store
 from torch import Tensor, nn
 from word_scene import WordScene
 
 from splatseg.core.voxels import StoredTable
 from splatseg.io.scene import load_scene
-from splatseg.lift.voxels import TableWords, store
 
 _CHUNK = 16_384
 _SAMPLE = 32_768

@@ -25,8 +25,7 @@ from splatseg.io.captures.nerfstudio import (
     lens_of,
 )
 from splatseg.io.captures.raw_views import checked_pose, opencv_from_opengl
-from splatseg.io.foreign import made_from
-from splatseg.io.schema import malformed
+from splatseg.io.foreign import made_from, malformed
 
 _MODEL_NAMES = {
     "pinhole": "PINHOLE",

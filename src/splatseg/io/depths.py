@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from splatseg.core import DepthKind, DepthMap, View
 from splatseg.errors import InputError
 from splatseg.io.arrays import npz_names, read_npy, read_npz
-from splatseg.io.foreign import reading
+from splatseg.io.foreign import expect, reading
 from splatseg.io.images import open_image
-from splatseg.io.schema import expect
 
 DEPTH_NAME = "depth"
 """The array of an npz that is a depth map of evidence."""

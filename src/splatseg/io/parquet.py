@@ -21,9 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatseg.errors import MissingFileError, MissingPackageError, reason
-from splatseg.io.foreign import is_file, reading
+from splatseg.io.foreign import expect, is_file, malformed, reading
 from splatseg.io.limits import check_unpacked
-from splatseg.io.schema import expect, malformed
 
 Row = Mapping[str, Any]
 """Values by column: numbers, text, bytes, arrays of one axis for lists, None for nothing."""

@@ -24,9 +24,9 @@ from splatseg.core.models import Pointmap
 from splatseg.errors import InputError, MissingFileError, quoted
 from splatseg.io.arrays import read_npz, save_arrays
 from splatseg.io.atomic import atomic_file, named_write_failures
-from splatseg.io.foreign import made_from
+from splatseg.io.foreign import expect, made_from
 from splatseg.io.json_files import write_json
-from splatseg.io.schema import check_array, expect, read_structured
+from splatseg.io.schema import check_array, read_structured
 
 FORMAT = "splatseg-pointmaps"
 VERSION = 1

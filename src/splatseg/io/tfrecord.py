@@ -13,8 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from splatseg.io.foreign import reading
-from splatseg.io.schema import expect, malformed
+from splatseg.io.foreign import expect, malformed, reading
 
 _POLYNOMIAL = 0x82F63B78
 _MASK = 0xA282EAD8

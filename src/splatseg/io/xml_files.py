@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from splatseg.core.json_values import MAX_NUMBER
 from splatseg.errors import FileFormatError, quoted, reason
-from splatseg.io.foreign import reading
-from splatseg.io.schema import expect, malformed
+from splatseg.io.foreign import expect, malformed, reading
 from splatseg.io.text_numbers import numbers_of
 
 _CHUNK = 1 << 16

@@ -22,8 +22,7 @@ from splatseg.errors import InputError, quoted
 from splatseg.io.annotations._regions import Canvas, Region, merged
 from splatseg.io.evidence import Evidence
 from splatseg.io.evidence._base import MAX_FILE_ID
-from splatseg.io.foreign import made_from
-from splatseg.io.schema import expect, malformed
+from splatseg.io.foreign import expect, made_from, malformed
 
 AreaKind = Literal["masks", "labels", "panoptic"]
 """What areas can be given as."""

@@ -49,10 +49,10 @@ from splatseg.io.annotations._base import (
     parts_of,
 )
 from splatseg.io.annotations._regions import Canvas, Region, corners_of
-from splatseg.io.foreign import reading
+from splatseg.io.foreign import expect, malformed, reading
 from splatseg.io.json_files import read_json
 from splatseg.io.limits import check_unpacked
-from splatseg.io.schema import Side, expect, malformed, structured
+from splatseg.io.schema import Side, structured
 from splatseg.io.text_numbers import numbers_of
 from splatseg.io.xml_files import read_xml
 

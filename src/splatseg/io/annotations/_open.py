@@ -27,9 +27,9 @@ from splatseg.io.annotations._drawn import (
 from splatseg.io.evidence import Evidence, LabelEvidence, view_files
 from splatseg.io.evidence._base import HEADER_FILE
 from splatseg.io.evidence._labels import IdRule, Palette
+from splatseg.io.foreign import expect
 from splatseg.io.json_files import read_json_value
 from splatseg.io.label_tables import label_table
-from splatseg.io.schema import expect
 
 _CLASSES = "SegmentationClass"
 _CAMVID = "annot"

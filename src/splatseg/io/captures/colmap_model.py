@@ -29,8 +29,8 @@ from splatseg.core import CameraModel, PointCloud
 from splatseg.errors import InputError, quoted
 from splatseg.io.captures.points import point_cloud, read_ply_points
 from splatseg.io.captures.raw_views import Intrinsics, pose_of_quaternion
-from splatseg.io.foreign import read_bytes, reading
-from splatseg.io.schema import MAX_SIDE, expect, malformed
+from splatseg.io.foreign import expect, malformed, read_bytes, reading
+from splatseg.io.schema import MAX_SIDE
 
 _POSE = "d" * 7
 _CAMERA_SENSOR = 0

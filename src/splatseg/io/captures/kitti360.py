@@ -24,10 +24,9 @@ from splatseg.errors import InputError, MissingFileError
 from splatseg.io.captures.build import build_capture
 from splatseg.io.captures.points import point_cloud, vertex_colours
 from splatseg.io.captures.raw_views import Intrinsics, RawView, checked_pose, inverse_pose
-from splatseg.io.foreign import is_folder
+from splatseg.io.foreign import expect, is_folder, malformed
 from splatseg.io.images import find_images
 from splatseg.io.ply import read_ply_vertices, vertex_positions
-from splatseg.io.schema import expect, malformed
 from splatseg.io.text_numbers import (
     keyed_matrix,
     read_keyed_numbers,

@@ -17,10 +17,10 @@ from splatseg.io.captures.build import build_capture
 from splatseg.io.captures.colmap_model import points_beside
 from splatseg.io.captures.points import point_cloud, read_ply_points
 from splatseg.io.captures.raw_views import Intrinsics, RawView, inverse_pose
-from splatseg.io.foreign import is_file
+from splatseg.io.foreign import expect, is_file
 from splatseg.io.images import find_images, image_size
 from splatseg.io.ply import read_ply_vertices, vertex_positions
-from splatseg.io.schema import MAX_SIDE, check_array, expect, read_structured
+from splatseg.io.schema import MAX_SIDE, check_array, read_structured
 from splatseg.io.text_numbers import read_numbers
 
 LLFF_FILE = "poses_bounds.npy"

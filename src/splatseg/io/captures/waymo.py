@@ -30,10 +30,10 @@ from splatseg.io.captures.waymo_tfrecord import (
     context_of,
     unpack_components,
 )
-from splatseg.io.foreign import is_file
+from splatseg.io.foreign import expect, is_file
 from splatseg.io.json_files import read_json, write_json
 from splatseg.io.parquet import Row, RowReader, bytes_of, integer_of, list_of, number_of, read_rows
-from splatseg.io.schema import MAX_SIDE, expect
+from splatseg.io.schema import MAX_SIDE
 
 IMAGES = "camera_image"
 LIDAR = "lidar"

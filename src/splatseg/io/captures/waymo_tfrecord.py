@@ -19,11 +19,10 @@ from numpy.typing import NDArray
 
 from splatseg.errors import SplatsegError
 from splatseg.io.atomic import atomic_folder, sweep
-from splatseg.io.foreign import reading
+from splatseg.io.foreign import expect, malformed, reading
 from splatseg.io.json_files import read_json, write_json
 from splatseg.io.limits import check_unpacked, max_unpacked
 from splatseg.io.parquet import RowWriter, writing_rows
-from splatseg.io.schema import expect, malformed
 from splatseg.io.tfrecord import Message, packed_integers, parse_message, read_records
 
 ENDING = ".tfrecord"

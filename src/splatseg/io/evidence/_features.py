@@ -26,7 +26,8 @@ from splatseg.errors import InputError
 from splatseg.io.arrays import read_npz
 from splatseg.io.depths import depth_kind, read_depth_map
 from splatseg.io.evidence._base import EvidenceKind, FileEvidence
-from splatseg.io.schema import check_array, expect
+from splatseg.io.foreign import expect
+from splatseg.io.schema import check_array
 
 QUANTISATION_FILE = "quant.npz"
 BASIS_FILE = "basis.npz"

@@ -14,9 +14,8 @@ from pathlib import Path
 from typing import BinaryIO
 
 from splatseg.errors import MissingPackageError
-from splatseg.io.foreign import reading
+from splatseg.io.foreign import expect, reading
 from splatseg.io.limits import check_unpacked
-from splatseg.io.schema import expect
 
 _HEADER = 227
 _POINT_BYTES = {

@@ -25,11 +25,11 @@ from splatseg.errors import MissingFileError, MissingPackageError
 from splatseg.io.arrays import npz_names, read_npy, read_npz
 from splatseg.io.captures import read_metadata
 from splatseg.io.captures.raw_views import checked_pose
-from splatseg.io.foreign import reading
+from splatseg.io.foreign import expect, malformed, reading
 from splatseg.io.ply import PlyHeader, read_ply_header, read_ply_tables
 from splatseg.io.scans._las_sizes import check_las_sizes
 from splatseg.io.scans._source import Piece, RawScan, Scans, read_in_pieces, refuse_twice
-from splatseg.io.schema import check_array, expect, malformed
+from splatseg.io.schema import check_array
 
 SUFFIXES = {".las": "las", ".laz": "las", ".ply": "ply", ".npz": "npz", ".npy": "npz"}
 """Formats by the endings of their files."""

@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from splatseg.errors import InputError, MissingFileError
 from splatseg.io.captures.raw_views import checked_pose
-from splatseg.io.foreign import read_lines
+from splatseg.io.foreign import malformed, read_lines
 from splatseg.io.label_tables import label_table
 from splatseg.io.scans._source import (
     RawScan,
@@ -35,7 +35,6 @@ from splatseg.io.scans._source import (
     read_records,
     skipped,
 )
-from splatseg.io.schema import malformed
 from splatseg.io.text_numbers import (
     keyed_matrix,
     numbers_of,

@@ -30,6 +30,7 @@ from splatseg.io.captures.kitti360 import (
     static_windows,
     velodyne_pose,
 )
+from splatseg.io.foreign import expect
 from splatseg.io.label_tables import label_table
 from splatseg.io.scans._source import (
     RawScan,
@@ -41,7 +42,6 @@ from splatseg.io.scans._source import (
 )
 from splatseg.io.scans.files import ply_pieces, positions, whole_ids
 from splatseg.io.scans.kitti import read_points
-from splatseg.io.schema import expect
 from splatseg.io.text_numbers import read_times, time_at
 
 _MAX_GAP = 3
