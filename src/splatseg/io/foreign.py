@@ -53,10 +53,17 @@ def malformed(where: object, expected: str, got: object = _NOTHING) -> FileForma
     return FileFormatError(f"{where}: expected {expected}{came}.")
 
 
-def expect(holds: object, where: object, expected: str, got: object = _NOTHING) -> None:
-    """Raise `malformed` unless something holds."""
+def expect(
+    holds: object,
+    where: object,
+    expected: str,
+    got: object = _NOTHING,
+    *,
+    error: type[InputError] = FileFormatError,
+) -> None:
+    """Raise what `malformed` says, as an `error`, unless something holds."""
     if not holds:
-        raise malformed(where, expected, got)
+        raise error(*malformed(where, expected, got).args)
 
 
 @contextmanager

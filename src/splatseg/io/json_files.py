@@ -106,12 +106,9 @@ def check_version(
     found = content.get("version")
     if content.get("format") != format or type(found) is not int:
         raise FileFormatError(f"{path}: expected {what}, got {quoted(content.get('format'))}.")
-    expect(
-        1 <= found <= version,
-        path,
-        f"{what} of version {version} or less, got version {quoted(found)}; a later splatseg wrote "
-        "it",
-    )
+    wanted = f"{what} of version {version} or less, got version {quoted(found)}; a later splatseg "
+    wanted += "wrote it"
+    expect(1 <= found <= version, path, wanted)
 
 
 def write_json(value: Mapping[str, Any], path: Path) -> None:

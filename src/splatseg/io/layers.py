@@ -104,11 +104,7 @@ def save_layer(layer: Layer, path: Path) -> None:
         InputError: If an id is 0 (ids in use start at 1).
         MissingFileError: If the folder of `path` does not exist.
     """
-    header: dict[str, Any] = {
-        "format": FORMAT,
-        "version": _WITHOUT_CONFIDENCE,
-        "count": len(layer),
-    }
+    header: dict[str, Any] = {"format": FORMAT, "version": _WITHOUT_CONFIDENCE, "count": len(layer)}
     match layer:
         case Labels():
             header |= {"kind": "labels", "background": _void(layer.background)}
@@ -314,18 +310,12 @@ class _File:
         fits = typed and array.ndim == len(shape)
         fits = fits and all(n in (None, m) for n, m in zip(shape, array.shape, strict=True))
         wanted = ", ".join("any" if length is None else str(length) for length in shape)
-        expect(
-            fits,
-            self.path,
-            f"{name!r} of type {kind} and shape ({wanted}), got {array.dtype} of {array.shape}",
-        )
+        what = f"{name!r} of type {kind} and shape ({wanted}), got {array.dtype} of {array.shape}"
+        expect(fits, self.path, what)
         if array.dtype.kind == "f":
             bad = int(array.size - np.isfinite(array).sum())
-            expect(
-                not bad,
-                self.path,
-                f"finite {name!r}, got {bad} of {array.size} values that are NaN or infinite",
-            )
+            what = f"finite {name!r}, got {bad} of {array.size} values that are NaN or infinite"
+            expect(not bad, self.path, what)
         elif array.dtype.kind == "i" and not signed:
             low = array.min(initial=0)
             expect(low >= 0, self.path, f"{name!r} of 0 (none) or more, got {low}")

@@ -49,11 +49,9 @@ def read_records(path: Path) -> Iterator[bytes]:
             whole = "a whole record, but the file ends early"
             expect(len(head) == _HEAD.size, where, whole)
             length, check = _HEAD.unpack(head)
-            expect(
-                masked_crc32c(head[:8]) == check,
-                where,
-                "the checksum of its length, got another; the file is damaged, or no TFRecord file",
-            )
+            wanted = "the checksum of its length, got another; the file is damaged, or no TFRecord "
+            wanted += "file"
+            expect(masked_crc32c(head[:8]) == check, where, wanted)
             expect(length <= size - stream.tell() - 4, where, whole)
             with reading(path, "a TFRecord file"):
                 content = stream.read(length)

@@ -460,8 +460,5 @@ class _Cursor:
     def finish(self) -> None:
         """Refuse bytes after the last record."""
         more = len(self._data) - self._offset
-        expect(
-            not more,
-            self._path,
-            f"the end of the file at byte {self._offset}, got {more} bytes more: it is corrupt",
-        )
+        what = f"the end of the file at byte {self._offset}, got {more} bytes more: it is corrupt"
+        expect(not more, self._path, what)

@@ -109,9 +109,8 @@ def _text(message: Message, number: int, where: str) -> str:
 def _lens(index: int) -> "Callable[[Message, int, str], float]":
     def take(message: Message, number: int, where: str) -> float:
         numbers = _doubles(message, number, where)
-        expect(
-            len(numbers) == len(LENS), where, f"{len(LENS)} numbers of a lens, got {len(numbers)}"
-        )
+        what = f"{len(LENS)} numbers of a lens, got {len(numbers)}"
+        expect(len(numbers) == len(LENS), where, what)
         return float(numbers[index])
 
     return take

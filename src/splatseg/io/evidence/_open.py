@@ -270,10 +270,7 @@ def _check_finished(folder: Path, header: Mapping[str, Any], *, views: int) -> N
 
 
 def _kind(
-    folder: Path,
-    maps: Mapping[str, Path],
-    objects: Mapping[str, Path],
-    arrays: Mapping[str, Path],
+    folder: Path, maps: Mapping[str, Path], objects: Mapping[str, Path], arrays: Mapping[str, Path]
 ) -> str | None:
     """The kind that files without a header show; the first one must hold what its kind has."""
     if maps and mask_folders(folder, marked_by="metadata.csv"):

@@ -128,13 +128,10 @@ def build_scan(name: str, raw: RawScan, classes: ClassTable | None) -> Scan:
     recorded = len(points)
     kept = np.ones(recorded, np.bool_) if raw.missing is None else ~raw.missing
     finite = np.isfinite(points).all(axis=1) | ~kept
-    expect(
-        finite.all(),
-        raw.where,
-        f"finite positions, got {int((~finite).sum())} of {recorded} that are NaN or infinite, the "
-        f"first at point {int(np.argmin(finite)) if recorded else 0}; a ray without a return has "
-        "a range of 0",
-    )
+    what = f"finite positions, got {int((~finite).sum())} of {recorded} that are NaN or infinite, "
+    what += f"the first at point {int(np.argmin(finite)) if recorded else 0}; a ray without a "
+    what += "return has a range of 0"
+    expect(finite.all(), raw.where, what)
     pose = raw.world_from_sensor
     if pose is not None:
         kept = kept & points.any(axis=1)

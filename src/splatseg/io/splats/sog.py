@@ -203,12 +203,9 @@ class _Bundle:
         count = self._count
         with self._opened(name, 8 * count + (1 << 20)) as image:
             pixels = image.width * image.height
-            expect(
-                count <= pixels <= 2 * count + (1 << 22),
-                self._path,
-                f"at least {count} pixels in {quoted(name)}, and not many more, got "
-                f"{image.width} x {image.height}",
-            )
+            what = f"at least {count} pixels in {quoted(name)}, and not many more, got "
+            what += f"{image.width} x {image.height}"
+            expect(count <= pixels <= 2 * count + (1 << 22), self._path, what)
             return self._decoded(name, image).reshape(-1, 4)[:count]
 
     def _opened(self, name: str, limit: int) -> Image.Image:
@@ -280,12 +277,9 @@ class _Bundle:
         with self._opened(name, 1 << 24) as image:
             coefficients = image.width // _PALETTE_WIDTH
             fits = not image.width % _PALETTE_WIDTH and coefficients in (3, 8, 15)
-            expect(
-                fits and image.height <= 1024,
-                path,
-                "a palette of 192, 512 or 960 pixels a row and at most 1024 rows in "
-                f"{quoted(name)}, got {image.width} x {image.height}",
-            )
+            what = "a palette of 192, 512 or 960 pixels a row and at most 1024 rows in "
+            what += f"{quoted(name)}, got {image.width} x {image.height}"
+            expect(fits and image.height <= 1024, path, what)
             pixels = self._decoded(name, image)[..., :3].reshape(-1, coefficients, 3)
         if self._meta.version == 1:
             if entry.mins is None or entry.maxs is None:
@@ -294,9 +288,8 @@ class _Bundle:
             return (entry.mins + (entry.maxs - entry.mins) * share).astype(np.float32)
         bands, count = entry.bands or 0, entry.count or 0
         fits = (bands + 1) ** 2 - 1 == coefficients
-        expect(
-            fits, f"{path}: shN.bands", f"the degree of {coefficients} coefficients, got {bands}"
-        )
+        what = f"the degree of {coefficients} coefficients, got {bands}"
+        expect(fits, f"{path}: shN.bands", what)
         most = f"at most the {len(pixels)} entries of the palette, got {count}"
         expect(count <= len(pixels), f"{path}: shN.count", most)
         codebook = np.full(256, np.nan, np.float32)
