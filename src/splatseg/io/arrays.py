@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from splatseg.errors import FileFormatError, MissingFileError, quoted
 from splatseg.io.atomic import named_write_failures, sync
-from splatseg.io.foreign import expect, reading
+from splatseg.io.foreign import expect, malformed, reading
 from splatseg.io.json_files import json_text
 from splatseg.io.limits import check_unpacked
 
@@ -107,9 +107,7 @@ def read_header(file: IO[bytes], *, size: int, where: object) -> ArrayHeader:
             (2, 0): np.lib.format.read_array_header_2_0,
         }.get(version)
         if read is None:
-            raise FileFormatError(
-                f"{where}: expected an array of NumPy of version 1 or 2, got version {version[0]}."
-            )
+            raise malformed(where, f"an array of NumPy of version 1 or 2, got version {version[0]}")
         shape, fortran, dtype = read(file, max_header_size=_MAX_HEADER)
         header = ArrayHeader(
             shape=tuple(int(n) for n in shape),

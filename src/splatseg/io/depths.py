@@ -42,7 +42,12 @@ def depth_kind(path: Path) -> DepthKind | None:
     Raises:
         FileFormatError: If it is no depth map of evidence.
     """
-    return _kind(path) if path.suffix == ".npz" else None
+    if path.suffix != ".npz":
+        return None
+    kind = read_npz(path, ["kind"])["kind"]
+    word = str(kind) if kind.ndim == 0 and kind.dtype.kind == "U" else ""
+    expect(word in _KINDS, path, "kind metric or relative", word)
+    return _KINDS[word]
 
 
 def read_depth_map(path: Path, *, unit: float | None = None) -> DepthMap:
@@ -87,13 +92,6 @@ def _values(path: Path) -> NDArray[np.generic]:
         return _numbers(path, read_npy(path))
     with open_image(path) as image, reading(path, "an image of depths"):
         return np.array(image)
-
-
-def _kind(path: Path) -> DepthKind:
-    kind = read_npz(path, ["kind"])["kind"]
-    word = str(kind) if kind.ndim == 0 and kind.dtype.kind == "U" else ""
-    expect(word in _KINDS, path, "kind metric or relative", word)
-    return _KINDS[word]
 
 
 def _confidence(path: Path, shape: tuple[int, ...]) -> NDArray[np.float32]:

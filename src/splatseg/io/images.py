@@ -29,9 +29,9 @@ from splatseg.errors import (
     FileFormatError,
     InputError,
     MissingFileError,
-    MissingPackageError,
     RangeError,
     ShapeError,
+    import_package,
 )
 from splatseg.io.atomic import atomic_file
 from splatseg.io.foreign import expect, is_file, reading
@@ -467,11 +467,4 @@ def check_encoder(fps: float) -> Any:
     """
     if not 0 < fps < 1000:
         raise RangeError(f"fps: expected a number in (0, 1000), got {fps}.")
-    try:
-        import imageio_ffmpeg
-    except ImportError as error:
-        raise MissingPackageError(
-            "a film needs a package that is not installed (imageio-ffmpeg). "
-            "Try: pip install 'splatseg[video]'."
-        ) from error
-    return imageio_ffmpeg
+    return import_package("imageio_ffmpeg", "a film", "video")

@@ -9,7 +9,7 @@ from typing import Any, cast
 from splatseg.core.json_values import plain_json
 from splatseg.errors import FileFormatError, InputError, quoted, reason
 from splatseg.io.atomic import atomic_file
-from splatseg.io.foreign import expect, read_bytes
+from splatseg.io.foreign import expect, malformed, read_bytes
 
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]|[\ud800-\udfff]")
 _LONE = re.compile("[\ud800-\udfff]")
@@ -36,9 +36,7 @@ def _parsed(text: str | bytes, *, where: str) -> object:
         decoded = text if isinstance(text, str) else text.decode(json.detect_encoding(text))
         value = json.loads(decoded)
     except (ValueError, RecursionError) as error:
-        raise FileFormatError(
-            f"{where}: expected JSON, but it cannot be parsed ({reason(error)})."
-        ) from error
+        raise malformed(where, f"JSON, but it cannot be parsed ({reason(error)})") from error
     if _SURROGATE.search(decoded) is not None:
         _refuse_surrogates(value, where)
     return value

@@ -37,7 +37,7 @@ from splatseg.core.json_values import MAX_NUMBER
 from splatseg.errors import FileFormatError, InputError, reason
 from splatseg.io.arrays import HEADER, open_npz, save_arrays
 from splatseg.io.atomic import atomic_file
-from splatseg.io.foreign import expect, made_from
+from splatseg.io.foreign import expect, made_from, malformed
 from splatseg.io.json_files import check_version, parse_object
 from splatseg.io.schema import structured
 
@@ -151,7 +151,7 @@ def save_layer(layer: Layer, path: Path) -> None:
 
 
 def _label_arrays(labels: Labels) -> _Columns:
-    arrays = _arrays_of(
+    return _arrays_of(
         ids=_ids(labels.ids),
         confidence=labels.confidence,
         candidates=None if labels.candidates is None else _ids(labels.candidates),
@@ -160,7 +160,6 @@ def _label_arrays(labels: Labels) -> _Columns:
         effective_views=_single(labels.effective_views),
         inferred=labels.inferred,
     )
-    return arrays
 
 
 def _arrays_of(**columns: Tensor | None) -> _Columns:
@@ -263,9 +262,7 @@ class _File:
             nodes = tuple(_node(row) for row in self.header.nodes or ())
             return InstanceTree(nodes=nodes, labels=labels)
         except (InputError, KeyError) as error:
-            raise FileFormatError(
-                f"{self.path}: expected nodes of a tree, got others ({reason(error)})."
-            ) from error
+            raise malformed(self.path, f"nodes of a tree, got others ({reason(error)})") from error
 
     def _voxels(self) -> VoxelFeatures:
         header = self.header

@@ -66,9 +66,7 @@ def read_xml(path: Path, kind: str, reader: XmlReader) -> Iterator[None]:
             try:
                 parser.Parse(piece, not piece)
             except expat.ExpatError as error:
-                raise FileFormatError(
-                    f"{path}: expected {kind}, but it cannot be read ({reason(error)})."
-                ) from error
+                raise malformed(path, f"{kind}, but it cannot be read ({reason(error)})") from error
             yield
             if not piece:
                 return

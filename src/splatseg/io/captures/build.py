@@ -262,10 +262,7 @@ def _located(path: Path, raw: Sequence[RawView]) -> tuple[list[RawView], list[st
 
 def _moved(photographs: Photographs, candidates: Sequence[Path]) -> Path | None:
     """The first of these that is there, None where none is."""
-    for candidate in candidates:
-        if (file := photographs.find(candidate)) is not None:
-            return file
-    return None
+    return next(filter(None, map(photographs.find, candidates)), None)
 
 
 def _cameras(

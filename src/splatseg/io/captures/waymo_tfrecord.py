@@ -102,8 +102,7 @@ def _packed(message: Message, number: int, where: str) -> bytes:
 
 
 def _text(message: Message, number: int, where: str) -> str:
-    name = message.get(number, [b""])[-1]
-    return name.decode(errors="replace") if isinstance(name, bytes) else ""
+    return _packed(message, number, where).decode(errors="replace")
 
 
 def _lens(index: int) -> "Callable[[Message, int, str], float]":

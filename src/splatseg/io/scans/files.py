@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splatseg.errors import MissingFileError, MissingPackageError
+from splatseg.errors import MissingFileError, import_package
 from splatseg.io.arrays import npz_names, read_npy, read_npz
 from splatseg.io.captures import read_metadata
 from splatseg.io.captures.raw_views import checked_pose
@@ -196,18 +196,10 @@ def _las_points(path: Path) -> Piece:
 @contextmanager
 def _open_las(path: Path) -> Generator[Any]:
     """A reader of laspy, whose failures are ours."""
-    missing = "laspy"
-    try:
-        import laspy
-
-        if path.suffix.lower() == ".laz":
-            missing = "lazrs"
-            import lazrs  # noqa: F401  # pyright: ignore[reportUnusedImport]
-    except ImportError as error:
-        raise MissingPackageError(
-            f"{path}: {path.suffix[1:].upper()} needs a package that is not installed "
-            f"({missing}). Try: pip install 'splatseg[las]'."
-        ) from error
+    what = f"{path}: {path.suffix[1:].upper()}"
+    laspy = import_package("laspy", what, "las")
+    if path.suffix.lower() == ".laz":
+        import_package("lazrs", what, "las")
     check_las_sizes(path)
     with reading(path, _LAS), path.open("rb") as file:
         try:

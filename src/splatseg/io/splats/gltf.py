@@ -25,7 +25,7 @@ from splatseg.core import Gaussians, Similarity
 from splatseg.core.rigid import rotation_from_quaternion
 from splatseg.core.sh import MAX_DEGREE, SH_C0
 from splatseg.errors import FileFormatError, MissingFileError, quoted
-from splatseg.io.foreign import expect, is_file, read_bytes
+from splatseg.io.foreign import expect, is_file, malformed, read_bytes
 from splatseg.io.json_files import parse_object
 from splatseg.io.schema import structured
 from splatseg.io.splats._rows import SOURCE_ROW, Array, Rows, check_size, finish, read_file, warn
@@ -408,9 +408,7 @@ class _Gltf:
             elif self._binary is not None and index == 0:
                 data = self._binary
             else:
-                raise FileFormatError(
-                    f"{where}: expected a uri, or buffer 0 of a .glb file with a binary part."
-                )
+                raise malformed(where, "a uri, or buffer 0 of a .glb file with a binary part")
             have = f"{entry.byteLength} bytes, got {len(data)}: truncated"
             expect(len(data) >= entry.byteLength, where, have)
             self._buffers[index] = data

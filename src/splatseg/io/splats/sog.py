@@ -14,6 +14,7 @@ import json
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -27,7 +28,7 @@ from splatseg.core.gaussians import sigmoid
 from splatseg.core.sh import MAX_DEGREE
 from splatseg.errors import FileFormatError, InputError, MissingFileError, quoted
 from splatseg.io.arrays import open_archive, open_member
-from splatseg.io.foreign import expect, is_file, read_bytes, reading
+from splatseg.io.foreign import expect, is_file, malformed, read_bytes, reading
 from splatseg.io.json_files import parse_object
 from splatseg.io.schema import structured
 from splatseg.io.splats._quantisation import assemble, scalar_codebook, split, vector_palette
@@ -125,20 +126,14 @@ def read_sog(path: Path, *, strict: bool = False) -> Gaussians:
     if not bundled:
         beside = [file for file in path.parent.glob("*.webp") if file.is_file()]
         packed = sum(file.stat().st_size for file in (path, *beside))
-
-        def load_file(name: str, limit: int) -> bytes:
-            return _load_beside(path, name, limit)
-
-        return _Bundle(path, load_file, path.name, packed).gaussians(strict=strict)
+        load = partial(_load_beside, path)
+        return _Bundle(path, load, path.name, packed).gaussians(strict=strict)
     with open_archive(path, where=path, expected="a zip file of SOG") as archive:
         metas = [n for n in archive.namelist() if n.rsplit("/", 1)[-1] == "meta.json"]
         expect(len(metas) == 1, path, f"a zip file with one meta.json, got {len(metas)}")
         folder = metas[0].removesuffix("meta.json")
-
-        def load_member(name: str, limit: int) -> bytes:
-            return _load_member(path, archive, folder + name, limit)
-
-        bundle = _Bundle(path, load_member, "meta.json", path.stat().st_size)
+        load = partial(_load_member, path, archive, folder)
+        bundle = _Bundle(path, load, "meta.json", path.stat().st_size)
         return bundle.gaussians(strict=strict)
 
 
@@ -155,8 +150,9 @@ def _load_beside(path: Path, name: str, limit: int) -> bytes:
     return read_bytes(member, "a picture of SOG")
 
 
-def _load_member(path: Path, archive: zipfile.ZipFile, name: str, limit: int) -> bytes:
+def _load_member(path: Path, archive: zipfile.ZipFile, folder: str, name: str, limit: int) -> bytes:
     """A member of a zip file, unpacked only if it is as small as it should be."""
+    name = folder + name
     with open_member(archive, name, where=path, expected="a zip file of SOG") as (member, _):
         data = member.read(limit + 1)
     expect(len(data) <= limit, path, f"at most {limit} bytes in {quoted(name)}, got more")
@@ -215,9 +211,7 @@ class _Bundle:
             with reading(self._path, f"a WebP picture in {quoted(name)}"):
                 return Image.open(io.BytesIO(data), formats=["WEBP"])
         except Image.DecompressionBombError as error:
-            raise FileFormatError(
-                f"{self._path}: expected a smaller WebP picture in {quoted(name)}."
-            ) from error
+            raise malformed(self._path, f"a smaller WebP picture in {quoted(name)}") from error
 
     def _decoded(self, name: str, image: Image.Image) -> Pixels:
         """All pixels (height, width, 4); alpha is 255 where the picture has none."""

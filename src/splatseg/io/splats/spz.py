@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from splatseg.core import Gaussians
 from splatseg.core.sh import MAX_DEGREE
 from splatseg.errors import FileFormatError, RangeError, reason
-from splatseg.io.foreign import expect
+from splatseg.io.foreign import expect, malformed
 from splatseg.io.splats._quantisation import pack_signed_three, unpack_signed_three
 from splatseg.io.splats._rows import (
     Array,
@@ -140,9 +140,7 @@ def _unpack_gzip(path: Path, data: bytes) -> tuple[_Header, list[memoryview]]:
         # Extensions may follow the attributes; anything else after them is a wrong count.
         more = stream.decompress(stream.unconsumed_tail, 1) if not stream.eof else b""
     except zlib.error as error:
-        raise FileFormatError(
-            f"{path}: expected gzip data of an SPZ file: {reason(error)}."
-        ) from error
+        raise malformed(path, f"gzip data of an SPZ file: {reason(error)}") from error
     wanted = f"{body} bytes for {header.count} Gaussians of degree {header.degree}"
     enough = len(content) == body
     expect(enough, path, f"{wanted}, got {len(content)}: the file is truncated")
