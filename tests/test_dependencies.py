@@ -23,7 +23,7 @@ TOOLS = {  # of dev: programs, and what a test runs in a process of its own
 ELSEWHERE = {ROOT / "tests/golden/make_annotations.py"}
 """Run in an environment of its own, beside the tools whose files it makes."""
 
-BY_NAME = re.compile(r"(?:import_module|find_spec|importorskip)\(\"([\w.]+)\"")
+BY_NAME = re.compile(r"(?:import_module|import_package|find_spec|importorskip)\(\"([\w.]+)\"")
 
 
 def imported(folder: Path) -> set[str]:
