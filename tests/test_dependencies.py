@@ -23,7 +23,8 @@ TOOLS = {  # of dev: programs, and what a test runs in a process of its own
 ELSEWHERE = {ROOT / "tests/golden/make_annotations.py"}
 """Run in an environment of its own, beside the tools whose files it makes."""
 
-BY_NAME = re.compile(r"(?:import_module|find_spec|importorskip)\(\"([\w.]+)\"")
+BY_NAME = re.compile(r"(?:import_module|import_package|find_spec|importorskip)\(\"([\w.]+)\"")
+EXTRA_NAMED = re.compile(r"splatseg\[([\w,]+)\]|import_package\([^)]*, \"(\w+)\"\)")
 
 
 def imported(folder: Path) -> set[str]:
@@ -104,7 +105,9 @@ def test_extras_that_are_named_exist() -> None:
     named = {
         extra
         for path in files
-        for found in re.findall(r"splatseg\[([\w,]+)\]", path.read_text(encoding="utf-8"))
+        for pair in EXTRA_NAMED.findall(path.read_text(encoding="utf-8"))
+        for found in pair
+        if found
         for extra in found.split(",")
     }
     assert named == set(EXTRAS) - {"dev"}

@@ -16,8 +16,10 @@ text, of any length and with any characters: `quoted` and `reason` make it fit f
 `visible` for people, and none is longer than a message may be.
 """
 
+import importlib
 import re
 import reprlib
+from typing import Any
 
 _QUOTED = 60
 _REASON = 120
@@ -70,6 +72,27 @@ class MissingPackageError(SplatsegError, ImportError):
 
 class BackendError(SplatsegError, RuntimeError):
     """A rendering backend cannot run here or refuses what was asked of it."""
+
+
+def import_package(name: str, what: str, extra: str) -> Any:
+    """A module of an optional package.
+
+    Args:
+        name: The module.
+        what: What needs it; starts the message.
+        extra: The extra of splatseg that installs it.
+
+    Raises:
+        MissingPackageError: If it is not installed.
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        package = name.partition(".")[0].replace("_", "-")
+        raise MissingPackageError(
+            f"{what} needs a package that is not installed ({package}). Try: pip install "
+            f"'splatseg[{extra}]'."
+        ) from error
 
 
 def _fitting(message: str) -> str:

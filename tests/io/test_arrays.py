@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from splatseg.errors import FileFormatError, MissingFileError
-from splatseg.io.arrays import map_values, npz_names, open_npz, read_npy, read_npz
+from splatseg.io.arrays import npz_names, open_npz, read_npy, read_npz
 from splatseg.io.limits import FREE
 
 HUGE = "(1099511627775, 4)"
@@ -153,23 +153,6 @@ def test_long_names_are_cut_in_messages(tmp_path) -> None:
     with pytest.raises(FileFormatError) as caught:
         read_npz(path, ["a"])
     assert len(str(caught.value)) < len(str(path)) + 300
-
-
-def test_values_without_a_header_are_held_against_the_file(tmp_path) -> None:
-    path = tmp_path / "values.bin"
-    want = np.arange(6, dtype="<u2").reshape(3, 2)
-    path.write_bytes(want.tobytes())
-    found = map_values(path, dtype="<u2", shape=(3, 2))
-    np.testing.assert_array_equal(found, want)
-    found[0] = 9  # a copy of the page: the file stays
-    np.testing.assert_array_equal(map_values(path, dtype="<u2", shape=(3, 2)), want)
-    for shape in ((3, 1), (4, 2)):
-        with pytest.raises(FileFormatError, match="values.bin: expected .* bytes"):
-            map_values(path, dtype="<u2", shape=shape)
-    path.write_bytes(b"")
-    assert map_values(path, dtype="<u2", shape=(0, 2)).shape == (0, 2)
-    with pytest.raises(MissingFileError):
-        map_values(tmp_path / "none.bin", dtype="<u2", shape=(1,))
 
 
 def test_no_other_reader_of_arrays_or_json_is_in_the_package() -> None:

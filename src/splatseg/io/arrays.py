@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from splatseg.errors import FileFormatError, MissingFileError, quoted
 from splatseg.io.atomic import named_write_failures, sync
-from splatseg.io.foreign import expect, reading
+from splatseg.io.foreign import expect, malformed, reading
 from splatseg.io.json_files import json_text
 from splatseg.io.limits import check_unpacked
 
@@ -60,11 +60,10 @@ def open_member(
         info = archive.NameToInfo.get(name)
         if info is None:
             raise FileFormatError(f"{where}: expected a member {quoted(name)}, got none.")
-        if info.compress_type not in _METHODS or info.flag_bits & _ENCRYPTED:
-            raise FileFormatError(
-                f"{where}: expected {quoted(name)} stored or deflated, got a member that is "
-                "encrypted or compressed otherwise."
-            )
+        what = f"{quoted(name)} stored or deflated, got a member that is encrypted or compressed "
+        what += "otherwise"
+        plain = info.compress_type in _METHODS and not info.flag_bits & _ENCRYPTED
+        expect(plain, where, what)
         with archive.open(info) as member:
             yield member, info.file_size
 
@@ -108,9 +107,7 @@ def read_header(file: IO[bytes], *, size: int, where: object) -> ArrayHeader:
             (2, 0): np.lib.format.read_array_header_2_0,
         }.get(version)
         if read is None:
-            raise FileFormatError(
-                f"{where}: expected an array of NumPy of version 1 or 2, got version {version[0]}."
-            )
+            raise malformed(where, f"an array of NumPy of version 1 or 2, got version {version[0]}")
         shape, fortran, dtype = read(file, max_header_size=_MAX_HEADER)
         header = ArrayHeader(
             shape=tuple(int(n) for n in shape),
@@ -140,29 +137,6 @@ def read_npy(path: Path, *, mapped: bool = False) -> NDArray[Any]:
         if mapped and header.nbytes:
             return _mapped(path, header, offset=header.offset)
         return filled(file, header)
-
-
-def map_values(path: Path, *, dtype: str, shape: tuple[int, ...]) -> NDArray[Any]:
-    """Values of a file without a header, left in it: pages are read when they are looked at.
-
-    Args:
-        path: The file.
-        dtype: Type of a value, with its byte order.
-        shape: Of the array that the file holds and nothing else.
-
-    Raises:
-        MissingFileError: If there is no such file.
-        FileFormatError: If it is shorter or longer than these values.
-    """
-    header = ArrayHeader(shape=shape, dtype=np.dtype(dtype), order="C", offset=0)
-    with reading(path, "values of NumPy"):
-        size = path.stat().st_size
-        expect(
-            size == header.nbytes,
-            path,
-            f"{header.nbytes} bytes, {shape} values of {header.dtype}, got {size}",
-        )
-        return _mapped(path, header, offset=0) if size else np.zeros(shape, header.dtype)
 
 
 def _mapped(path: Path, header: ArrayHeader, *, offset: int) -> NDArray[Any]:
@@ -202,17 +176,11 @@ def _check(header: ArrayHeader, size: int, where: object) -> None:
     if dtype.kind not in KINDS or (dtype.kind != "U" and dtype.itemsize > _MAX_ITEM):
         what = "objects, and nothing is unpickled" if dtype.kind == "O" else repr(dtype.kind)
         raise FileFormatError(f"{where}: expected an array of numbers or text, got {what}.")
-    expect(
-        not any(not 0 <= side < _MAX_SIDE for side in shape)
-        and (not math.prod(shape) or dtype.itemsize),
-        where,
-        "the shape of an array, got one that cannot be",
-    )
-    expect(
-        header.offset + header.nbytes == size,
-        where,
-        f"{header.nbytes} bytes of values, as its header says, got {size - header.offset}",
-    )
+    sound = all(0 <= side < _MAX_SIDE for side in shape)
+    sound = sound and bool(not math.prod(shape) or dtype.itemsize)
+    expect(sound, where, "the shape of an array, got one that cannot be")
+    wanted = f"{header.nbytes} bytes of values, as its header says, got {size - header.offset}"
+    expect(header.offset + header.nbytes == size, where, wanted)
 
 
 _SUFFIX = ".npy"
@@ -241,11 +209,8 @@ class Npz:
             FileFormatError: If there is none of this name, it is damaged or holds objects, or the
                 archive would unpack to more than a file of its size may.
         """
-        expect(
-            name in self.names,
-            self.where,
-            f"an array {quoted(name)}, got {_listed(self.names) or 'none'}",
-        )
+        what = f"an array {quoted(name)}, got {_listed(self.names) or 'none'}"
+        expect(name in self.names, self.where, what)
         place = f"{self.where}: array {quoted(name)}"
         with open_member(
             self._archive, name + _SUFFIX, where=self.where, expected=self._expected

@@ -17,16 +17,9 @@ import torch
 from splatseg.core import Camera, View
 from splatseg.core.scene import view_name_fault
 from splatseg.errors import FileFormatError
-from splatseg.io.captures.nerfstudio import (
-    LENS_KEYS,
-    Frame,
-    frame_matrix,
-    frames_of,
-    lens_of,
-)
+from splatseg.io.captures.nerfstudio import LENS_KEYS, Frame, frame_matrix, frames_of, lens_of
 from splatseg.io.captures.raw_views import checked_pose, opencv_from_opengl
-from splatseg.io.foreign import made_from
-from splatseg.io.schema import malformed
+from splatseg.io.foreign import made_from, malformed
 
 _MODEL_NAMES = {
     "pinhole": "PINHOLE",

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from splatseg.core import DepthKind, DepthMap, View
 from splatseg.errors import InputError
 from splatseg.io.arrays import npz_names, read_npy, read_npz
-from splatseg.io.foreign import reading
+from splatseg.io.foreign import expect, reading
 from splatseg.io.images import open_image
-from splatseg.io.schema import expect
 
 DEPTH_NAME = "depth"
 """The array of an npz that is a depth map of evidence."""
@@ -43,7 +42,12 @@ def depth_kind(path: Path) -> DepthKind | None:
     Raises:
         FileFormatError: If it is no depth map of evidence.
     """
-    return _kind(path) if path.suffix == ".npz" else None
+    if path.suffix != ".npz":
+        return None
+    kind = read_npz(path, ["kind"])["kind"]
+    word = str(kind) if kind.ndim == 0 and kind.dtype.kind == "U" else ""
+    expect(word in _KINDS, path, "kind metric or relative", word)
+    return _KINDS[word]
 
 
 def read_depth_map(path: Path, *, unit: float | None = None) -> DepthMap:
@@ -88,13 +92,6 @@ def _values(path: Path) -> NDArray[np.generic]:
         return _numbers(path, read_npy(path))
     with open_image(path) as image, reading(path, "an image of depths"):
         return np.array(image)
-
-
-def _kind(path: Path) -> DepthKind:
-    kind = read_npz(path, ["kind"])["kind"]
-    word = str(kind) if kind.ndim == 0 and kind.dtype.kind == "U" else ""
-    expect(word in _KINDS, path, "kind metric or relative", word)
-    return _KINDS[word]
 
 
 def _confidence(path: Path, shape: tuple[int, ...]) -> NDArray[np.float32]:

@@ -14,6 +14,7 @@ from splatseg.errors import (
     InputError,
     MissingFileError,
     SplatsegError,
+    quoted,
     reason,
 )
 
@@ -37,17 +38,32 @@ _DAMAGED = (
 """What decoders of the standard library, NumPy and Pillow raise on damaged files: none of them
 documents it, and flipped bits have found each of these."""
 
+_NOTHING = object()
 
-def expect(fits: object, where: object, what: str) -> None:
-    """Raise `FileFormatError` unless a file is as it should be.
+
+def malformed(where: object, expected: str, got: object = _NOTHING) -> FileFormatError:
+    """The error of a file that holds something else: ``WHERE: expected EXPECTED, got GOT.``.
 
     Args:
-        fits: Whether it is.
-        where: The file, and the place in it; starts the message.
-        what: What is expected and what came, after the word "expected".
+        where: The file, and the place in it.
+        expected: What should be there, with ", got ..." where `got` is not passed.
+        got: What is there; None is "none".
     """
-    if not fits:
-        raise FileFormatError(f"{where}: expected {what}.")
+    came = "" if got is _NOTHING else f", got {'none' if got is None else quoted(got)}"
+    return FileFormatError(f"{where}: expected {expected}{came}.")
+
+
+def expect(
+    holds: object,
+    where: object,
+    expected: str,
+    got: object = _NOTHING,
+    *,
+    error: type[InputError] = FileFormatError,
+) -> None:
+    """Raise what `malformed` says, as an `error`, unless something holds."""
+    if not holds:
+        raise error(*malformed(where, expected, got).args)
 
 
 @contextmanager

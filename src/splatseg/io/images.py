@@ -29,9 +29,9 @@ from splatseg.errors import (
     FileFormatError,
     InputError,
     MissingFileError,
-    MissingPackageError,
     RangeError,
     ShapeError,
+    import_package,
 )
 from splatseg.io.atomic import atomic_file
 from splatseg.io.foreign import expect, is_file, reading
@@ -144,12 +144,9 @@ def load_mask(view: View, *, longest: int | None = None) -> UInt8[Tensor, "heigh
         return None
     width, height = view.camera.width, view.camera.height
     grey = _grey(view.mask)
-    expect(
-        same_shape(width, height, grey.shape[1], grey.shape[0]),
-        view.mask,
-        f"{width}x{height} pixels as the photograph of view {view.name!r} has, or a uniform scale "
-        f"of it, got {grey.shape[1]}x{grey.shape[0]}",
-    )
+    what = f"{width}x{height} pixels as the photograph of view {view.name!r} has, or a uniform "
+    what += f"scale of it, got {grey.shape[1]}x{grey.shape[0]}"
+    expect(same_shape(width, height, grey.shape[1], grey.shape[0]), view.mask, what)
     used = Image.fromarray(np.where(grey > 0, 255, 0).astype(np.uint8))
     used = _reduced(used, width, height, longest)
     return torch.from_numpy((np.asarray(used) == 255).astype(np.uint8))
@@ -211,12 +208,9 @@ def load_alpha(view: View, *, longest: int | None = None) -> UInt8[Tensor, "heig
 def _check_size(path: Path, view: View, size: tuple[int, int]) -> None:
     """Refuse an image of another size than the photograph of a view has."""
     camera = view.camera
-    expect(
-        size == (camera.width, camera.height),
-        path,
-        f"{camera.width}x{camera.height} pixels as the camera of view {view.name!r} has, got "
-        f"{size[0]}x{size[1]}",
-    )
+    what = f"{camera.width}x{camera.height} pixels as the camera of view {view.name!r} has, got "
+    what += f"{size[0]}x{size[1]}"
+    expect(size == (camera.width, camera.height), path, what)
 
 
 def _grey(path: Path) -> NDArray[Any]:
@@ -473,11 +467,4 @@ def check_encoder(fps: float) -> Any:
     """
     if not 0 < fps < 1000:
         raise RangeError(f"fps: expected a number in (0, 1000), got {fps}.")
-    try:
-        import imageio_ffmpeg
-    except ImportError as error:
-        raise MissingPackageError(
-            "a film needs a package that is not installed (imageio-ffmpeg). "
-            "Try: pip install 'splatseg[video]'."
-        ) from error
-    return imageio_ffmpeg
+    return import_package("imageio_ffmpeg", "a film", "video")

@@ -1,16 +1,15 @@
-"""JSON in files: read with clear errors, at once or row by row, and written whole."""
+"""JSON in files: read with clear errors, and written whole."""
 
-import codecs
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, BinaryIO, cast
+from typing import Any, cast
 
 from splatseg.core.json_values import plain_json
 from splatseg.errors import FileFormatError, InputError, quoted, reason
 from splatseg.io.atomic import atomic_file
-from splatseg.io.foreign import expect, read_bytes, reading
+from splatseg.io.foreign import expect, malformed, read_bytes
 
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]|[\ud800-\udfff]")
 _LONE = re.compile("[\ud800-\udfff]")
@@ -37,9 +36,7 @@ def _parsed(text: str | bytes, *, where: str) -> object:
         decoded = text if isinstance(text, str) else text.decode(json.detect_encoding(text))
         value = json.loads(decoded)
     except (ValueError, RecursionError) as error:
-        raise FileFormatError(
-            f"{where}: expected JSON, but it cannot be parsed ({reason(error)})."
-        ) from error
+        raise malformed(where, f"JSON, but it cannot be parsed ({reason(error)})") from error
     if _SURROGATE.search(decoded) is not None:
         _refuse_surrogates(value, where)
     return value
@@ -107,12 +104,9 @@ def check_version(
     found = content.get("version")
     if content.get("format") != format or type(found) is not int:
         raise FileFormatError(f"{path}: expected {what}, got {quoted(content.get('format'))}.")
-    expect(
-        1 <= found <= version,
-        path,
-        f"{what} of version {version} or less, got version {quoted(found)}; a later splatseg wrote "
-        "it",
-    )
+    wanted = f"{what} of version {version} or less, got version {quoted(found)}; a later splatseg "
+    wanted += "wrote it"
+    expect(1 <= found <= version, path, wanted)
 
 
 def write_json(value: Mapping[str, Any], path: Path) -> None:
@@ -125,103 +119,3 @@ def write_json(value: Mapping[str, Any], path: Path) -> None:
     text = json_text(path.name, value, indent=1)
     with atomic_file(path) as temporary:
         temporary.write_text(text + "\n", encoding="utf-8", newline="\n")
-
-
-_CHUNK = 1 << 20
-_MAX_ROW = 1 << 24
-"""Characters of one row; those of real tables have a thousand."""
-
-_SPACE = re.compile(r"[ \t\r\n]*")
-
-
-def read_json_rows(path: Path) -> Iterator[dict[str, Any]]:
-    """The objects of a file that is one JSON list of objects, in its order.
-
-    Their numbers are unchecked: `io.schema` and `core.json_values` take them out.
-
-    Raises:
-        MissingFileError: If there is no such file.
-        FileFormatError: If it is not JSON, no list, ends early, or holds something else than
-            objects, or one of more than 16 million characters.
-    """
-    with reading(path, "a JSON file"):
-        stream = path.open("rb")
-    with stream:
-        yield from _rows(path, stream)
-
-
-def _rows(path: Path, stream: BinaryIO) -> Iterator[dict[str, Any]]:
-    text = _Text(path, stream)
-    if text.next() != "[":
-        raise FileFormatError(f"{path}: expected a JSON list of objects, got something else.")
-    text.drop(1)
-    if text.next() == "]":
-        text.drop(1)
-    else:
-        while True:
-            yield text.value()
-            sign = text.next()
-            if sign not in (",", "]"):
-                raise FileFormatError(f"{path}: expected a JSON list, but it ends or breaks early.")
-            text.drop(1)
-            if sign == "]":
-                break
-    if text.next():
-        raise FileFormatError(f"{path}: expected one JSON list, got more behind it.")
-
-
-class _Text:
-    """Text of a file of which a piece is in memory."""
-
-    def __init__(self, path: Path, stream: BinaryIO) -> None:
-        self._path, self._stream = path, stream
-        self._decode = codecs.getincrementaldecoder("utf-8-sig")()
-        self._scan = json.JSONDecoder().raw_decode
-        self._piece, self._at, self._ended = "", 0, False
-
-    def next(self) -> str:
-        """The next sign that is no space, empty at the end."""
-        while True:
-            found = _SPACE.match(self._piece, self._at)
-            self._at = len(self._piece) if found is None else found.end()
-            if self._at < len(self._piece):
-                return self._piece[self._at]
-            if self._ended:
-                return ""
-            self._more()
-
-    def drop(self, count: int) -> None:
-        """Pass over signs."""
-        self._at += count
-
-    def value(self) -> dict[str, Any]:
-        """The object that begins at the next sign."""
-        self.next()
-        while True:
-            try:
-                value, end = self._scan(self._piece, self._at)
-            except (ValueError, RecursionError) as error:
-                if self._ended or len(self._piece) - self._at > _MAX_ROW:
-                    raise FileFormatError(
-                        f"{self._path}: expected JSON, but a row cannot be parsed "
-                        f"({reason(error)})."
-                    ) from error
-                self._more()
-                continue
-            if not isinstance(value, dict):
-                raise FileFormatError(
-                    f"{self._path}: expected a list of JSON objects, got {quoted(value)} in it."
-                )
-            escaped = "\\u" in self._piece[self._at : end]
-            if escaped and _LONE.search(json.dumps(value, ensure_ascii=False)) is not None:
-                raise FileFormatError(f"{self._path}: expected Unicode text, got {quoted(value)}.")
-            self._at = end
-            return value
-
-    def _more(self) -> None:
-        with reading(self._path, "a JSON file"):
-            content = self._stream.read(_CHUNK)
-            text = self._decode.decode(content, final=not content)
-        self._ended = not content
-        self._piece = self._piece[self._at :] + text
-        self._at = 0

@@ -37,7 +37,7 @@ from splatseg.core.json_values import MAX_NUMBER
 from splatseg.errors import FileFormatError, InputError, reason
 from splatseg.io.arrays import HEADER, open_npz, save_arrays
 from splatseg.io.atomic import atomic_file
-from splatseg.io.foreign import expect, made_from
+from splatseg.io.foreign import expect, made_from, malformed
 from splatseg.io.json_files import check_version, parse_object
 from splatseg.io.schema import structured
 
@@ -104,11 +104,7 @@ def save_layer(layer: Layer, path: Path) -> None:
         InputError: If an id is 0 (ids in use start at 1).
         MissingFileError: If the folder of `path` does not exist.
     """
-    header: dict[str, Any] = {
-        "format": FORMAT,
-        "version": _WITHOUT_CONFIDENCE,
-        "count": len(layer),
-    }
+    header: dict[str, Any] = {"format": FORMAT, "version": _WITHOUT_CONFIDENCE, "count": len(layer)}
     match layer:
         case Labels():
             header |= {"kind": "labels", "background": _void(layer.background)}
@@ -155,7 +151,7 @@ def save_layer(layer: Layer, path: Path) -> None:
 
 
 def _label_arrays(labels: Labels) -> _Columns:
-    arrays = _arrays_of(
+    return _arrays_of(
         ids=_ids(labels.ids),
         confidence=labels.confidence,
         candidates=None if labels.candidates is None else _ids(labels.candidates),
@@ -164,7 +160,6 @@ def _label_arrays(labels: Labels) -> _Columns:
         effective_views=_single(labels.effective_views),
         inferred=labels.inferred,
     )
-    return arrays
 
 
 def _arrays_of(**columns: Tensor | None) -> _Columns:
@@ -267,9 +262,7 @@ class _File:
             nodes = tuple(_node(row) for row in self.header.nodes or ())
             return InstanceTree(nodes=nodes, labels=labels)
         except (InputError, KeyError) as error:
-            raise FileFormatError(
-                f"{self.path}: expected nodes of a tree, got others ({reason(error)})."
-            ) from error
+            raise malformed(self.path, f"nodes of a tree, got others ({reason(error)})") from error
 
     def _voxels(self) -> VoxelFeatures:
         header = self.header
@@ -314,18 +307,12 @@ class _File:
         fits = typed and array.ndim == len(shape)
         fits = fits and all(n in (None, m) for n, m in zip(shape, array.shape, strict=True))
         wanted = ", ".join("any" if length is None else str(length) for length in shape)
-        expect(
-            fits,
-            self.path,
-            f"{name!r} of type {kind} and shape ({wanted}), got {array.dtype} of {array.shape}",
-        )
+        what = f"{name!r} of type {kind} and shape ({wanted}), got {array.dtype} of {array.shape}"
+        expect(fits, self.path, what)
         if array.dtype.kind == "f":
             bad = int(array.size - np.isfinite(array).sum())
-            expect(
-                not bad,
-                self.path,
-                f"finite {name!r}, got {bad} of {array.size} values that are NaN or infinite",
-            )
+            what = f"finite {name!r}, got {bad} of {array.size} values that are NaN or infinite"
+            expect(not bad, self.path, what)
         elif array.dtype.kind == "i" and not signed:
             low = array.min(initial=0)
             expect(low >= 0, self.path, f"{name!r} of 0 (none) or more, got {low}")

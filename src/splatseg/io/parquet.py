@@ -20,10 +20,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from splatseg.errors import MissingFileError, MissingPackageError, reason
-from splatseg.io.foreign import is_file, reading
+from splatseg.errors import MissingFileError, import_package, reason
+from splatseg.io.foreign import expect, is_file, malformed, reading
 from splatseg.io.limits import check_unpacked
-from splatseg.io.schema import expect, malformed
 
 Row = Mapping[str, Any]
 """Values by column: numbers, text, bytes, arrays of one axis for lists, None for nothing."""
@@ -190,14 +189,8 @@ class RowWriter:
 
 
 def _arrow(path: Path) -> Any:
-    try:
-        importlib.import_module("pyarrow.parquet")
-        return importlib.import_module("pyarrow")
-    except ImportError as error:
-        raise MissingPackageError(
-            f"{path}: Parquet needs a package that is not installed (pyarrow). "
-            "Try: pip install 'splatseg[waymo]'."
-        ) from error
+    import_package("pyarrow.parquet", f"{path}: Parquet", "waymo")
+    return importlib.import_module("pyarrow")
 
 
 @contextmanager

@@ -272,11 +272,8 @@ def ply_offsets(path: Path, header: PlyHeader) -> dict[str, int]:
             # A value takes a digit and what parts it from the next, a list its length.
             least += 2 * element.count * len(element.properties)
         have = size - header.offset
-        expect(
-            have >= least - 1,
-            path,
-            f"lines of values of at least {least - 1} bytes, got {have}: the file is truncated",
-        )
+        what = f"lines of values of at least {least - 1} bytes, got {have}: the file is truncated"
+        expect(have >= least - 1, path, what)
         return offsets
     reader = _BinaryRows(path, header)
     for element in header.elements:
@@ -288,11 +285,8 @@ def ply_offsets(path: Path, header: PlyHeader) -> dict[str, int]:
         else:
             reader.next(element)
     fault = "truncated" if size < reader.at else "longer than its counts"
-    expect(
-        size == reader.at,
-        path,
-        f"{reader.at} bytes as its header promises, got {size}: the file is {fault}",
-    )
+    what = f"{reader.at} bytes as its header promises, got {size}: the file is {fault}"
+    expect(size == reader.at, path, what)
     return offsets
 
 
@@ -326,11 +320,8 @@ def read_ply_rows(
             with _parsing(path, f"lines of {len(element.properties)} numbers", element):
                 table = number_table(list(itertools.islice(lines, wanted)), len(element.properties))
             at += len(table)
-            expect(
-                len(table) == wanted,
-                path,
-                f"{total} lines of values, the file ends at {at}: it is truncated",
-            )
+            what = f"{total} lines of values, the file ends at {at}: it is truncated"
+            expect(len(table) == wanted, path, what)
             rows = np.empty(wanted, dtype)
             with np.errstate(over="ignore"), _parsing(path, "numbers", element):
                 for one, values in zip(element.properties, table.T, strict=True):
@@ -429,11 +420,8 @@ class _TextRows:
         """The table of the next element."""
         lines = self._lines[self._at : self._at + element.count]
         self._at += element.count
-        expect(
-            len(lines) == element.count,
-            self._path,
-            f"{element.count} rows of {quoted(element.name)}, got {len(lines)}",
-        )
+        what = f"{element.count} rows of {quoted(element.name)}, got {len(lines)}"
+        expect(len(lines) == element.count, self._path, what)
         with _parsing(
             self._path, f"{element.count} rows of {len(element.properties)} numbers", element
         ):

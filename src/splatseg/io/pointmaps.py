@@ -24,9 +24,9 @@ from splatseg.core.models import Pointmap
 from splatseg.errors import InputError, MissingFileError, quoted
 from splatseg.io.arrays import read_npz, save_arrays
 from splatseg.io.atomic import atomic_file, named_write_failures
-from splatseg.io.foreign import made_from
+from splatseg.io.foreign import expect, made_from
 from splatseg.io.json_files import write_json
-from splatseg.io.schema import check_array, expect, read_structured
+from splatseg.io.schema import check_array, read_structured
 
 FORMAT = "splatseg-pointmaps"
 VERSION = 1
@@ -86,11 +86,8 @@ class RecordedPointmaps:
             FileFormatError: If its file is damaged, or holds what is no pair of pointmaps.
         """
         path = self._path(first, second)
-        if not path.is_file():
-            raise MissingFileError(
-                f"{self.folder}: expected pointmaps of {quoted(first)} and {quoted(second)}, got "
-                "none of this pair."
-            )
+        what = f"pointmaps of {quoted(first)} and {quoted(second)}, got none of this pair"
+        expect(path.is_file(), self.folder, what, error=MissingFileError)
         arrays = read_npz(path, _ARRAYS)
         one, two = (
             _pointmap(path, arrays[f"points_{k}"], arrays[f"confidence_{k}"], k) for k in (1, 2)
@@ -117,11 +114,8 @@ class RecordedPointmaps:
 
     def _path(self, first: str, second: str) -> Path:
         for name in (first, second):
-            if name not in self.photographs:
-                raise InputError(
-                    f"{self.folder}: expected one of its {len(self.photographs)} photographs, got "
-                    f"{quoted(name)}."
-                )
+            what = f"one of its {len(self.photographs)} photographs, got {quoted(name)}"
+            expect(name in self.photographs, self.folder, what, error=InputError)
         i, j = self.photographs.index(first), self.photographs.index(second)
         return self.folder / f"{i:04d}_{j:04d}.npz"
 
@@ -140,11 +134,10 @@ def create_pointmaps(
         raise InputError("photographs: expected distinct file names, got one twice.")
     if (folder / HEADER_FILE).is_file():
         there = open_pointmaps(folder)
-        if there.photographs != names or there.metadata != dict(metadata):
-            raise InputError(
-                f"{folder}: expected pointmaps of these photographs and this model, got those of "
-                "others; remove it to begin again."
-            )
+        what = "pointmaps of these photographs and this model, got those of others; remove it to "
+        what += "begin again"
+        same = there.photographs == names and there.metadata == dict(metadata)
+        expect(same, folder, what, error=InputError)
         return there
     folder.mkdir(parents=True, exist_ok=True)
     header = {"format": FORMAT, "version": VERSION, "photographs": list(names)}

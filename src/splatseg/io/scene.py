@@ -41,12 +41,7 @@ from splatseg.io.atomic import (
     sync,
     sync_tree,
 )
-from splatseg.io.cameras import (
-    cameras_content,
-    relative_path,
-    source_paths,
-    views_from_content,
-)
+from splatseg.io.cameras import cameras_content, relative_path, source_paths, views_from_content
 from splatseg.io.foreign import expect, is_file, is_folder, made_from
 from splatseg.io.json_files import check_version, read_json, write_json
 from splatseg.io.layers import load_layer, save_layer
@@ -169,18 +164,12 @@ def load_scene(root: Path | str, *, data: Path | str | None = None) -> Scene:
         cameras, folder=root / "cameras", source=source, path=root / CAMERAS_FILE
     )
     gaussians = read_scene_splats(current_file(root, GAUSSIANS_FILE))
-    expect(
-        len(gaussians) == content.gaussians,
-        root / GAUSSIANS_FILE,
-        f"{content.gaussians} Gaussians as {SCENE_FILE} says, got {len(gaussians)}",
-    )
+    what = f"{content.gaussians} Gaussians as {SCENE_FILE} says, got {len(gaussians)}"
+    expect(len(gaussians) == content.gaussians, root / GAUSSIANS_FILE, what)
     of_view = {name: split for split, names in content.split.items() for name in names}
     once = sum(len(names) for names in content.split.values()) == len(views)
-    expect(
-        once and set(of_view) == {view.name for view in views},
-        where,
-        f"a split that names each view of {CAMERAS_FILE} once",
-    )
+    what = f"a split that names each view of {CAMERAS_FILE} once"
+    expect(once and set(of_view) == {view.name for view in views}, where, what)
     classes = None if content.classes is None else class_table(content.classes, where=str(where))
     with made_from(where):
         return Scene(
@@ -217,12 +206,9 @@ def load_scene_layer(root: Path | str, name: str) -> Layer:
         raise InputError(f"layer: expected one of {root} ({known}), got {name!r}.")
     layer = load_layer(root / "layers" / f"{name}.npz")
     count = _scene_content(root).gaussians
-    expect(
-        len(layer) == count,
-        root / "layers" / f"{name}.npz",
-        f"{count} rows as the scene has Gaussians, got {len(layer)}; the layer is from before the "
-        "Gaussians changed",
-    )
+    what = f"{count} rows as the scene has Gaussians, got {len(layer)}; the layer is from before "
+    what += "the Gaussians changed"
+    expect(len(layer) == count, root / "layers" / f"{name}.npz", what)
     return layer
 
 
@@ -247,19 +233,15 @@ def save_scene_layer(layer: Layer, root: Path | str, name: str) -> Path:
 @boundary
 def check_name(what: str, name: str) -> None:
     """Raise `InputError` unless `name` can be that of a layer or of evidence."""
-    if not _NAME.fullmatch(name):
-        raise InputError(
-            f"{what}: expected a name of letters, digits and _ . + - that does not start with "
-            f"a point or a sign, got {name!r}."
-        )
+    wanted = "a name of letters, digits and _ . + - that does not start with a point or a sign, "
+    wanted += f"got {name!r}"
+    expect(_NAME.fullmatch(name), what, wanted, error=InputError)
 
 
 def _check_layer(name: str, layer: Layer, count: int) -> None:
     check_name("layer", name)
-    if len(layer) != count:
-        raise InputError(
-            f"layer {name!r}: expected {count} rows as the scene has Gaussians, got {len(layer)}."
-        )
+    what = f"{count} rows as the scene has Gaussians, got {len(layer)}"
+    expect(len(layer) == count, f"layer {name!r}", what, error=InputError)
 
 
 def _replace(scene: Scene, root: Path, layers: Mapping[str, Layer]) -> None:
@@ -295,10 +277,7 @@ def _write(scene: Scene, folder: Path, layers: Mapping[str, Layer], *, final: Pa
             "gaussians": len(scene.gaussians),
             "source": None
             if source is None
-            else {
-                "relative": relative_path(source, start=final),
-                "absolute": source.as_posix(),
-            },
+            else {"relative": relative_path(source, start=final), "absolute": source.as_posix()},
             "split": {
                 split: [view.name for view in scene.views if view.split == split]
                 for split in splits

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from splatseg.core.json_values import MAX_NUMBER
 from splatseg.errors import FileFormatError, quoted
+from splatseg.io.foreign import malformed
 from splatseg.io.json_files import read_json_value
 
 T = TypeVar("T")
@@ -44,7 +45,6 @@ _Bad = tuple[str, float] | None
 """Where in a value a number is that is none, and the number."""
 
 _Check = Callable[[Any], _Bad]
-_NOTHING = object()
 _MAX_WHOLE = 2**53
 _PLACE = re.compile(r"^(?P<what>.*?)(?: - at `(?:key in )?\$(?P<at>.*)`)?$", re.DOTALL)
 _STEP = re.compile(r"\.([^.\[]+)|\[(\d+|\.\.\.)\]")
@@ -76,24 +76,6 @@ _KINDS = {
     "bui": "booleans or whole numbers",
     "U": "text",
 }
-
-
-def malformed(where: object, expected: str, got: object = _NOTHING) -> FileFormatError:
-    """The error of a file that holds something else: ``WHERE: expected EXPECTED, got GOT.``.
-
-    Args:
-        where: The file, and the place in it.
-        expected: What should be there, with ", got ..." where `got` is not passed.
-        got: What is there; None is "none".
-    """
-    came = "" if got is _NOTHING else f", got {'none' if got is None else quoted(got)}"
-    return FileFormatError(f"{where}: expected {expected}{came}.")
-
-
-def expect(holds: object, where: object, expected: str, got: object = _NOTHING) -> None:
-    """Raise `malformed` unless something holds."""
-    if not holds:
-        raise malformed(where, expected, got)
 
 
 def check_array(

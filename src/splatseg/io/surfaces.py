@@ -56,11 +56,8 @@ def read_surface(
         return _from_arrays(path, zero_is_class=zero_is_class, void=void)
     expect(path.suffix.lower() == ".ply", path, "labelled surfaces as .ply or .npz, got another")
     tables = read_ply_tables(path, read_ply_header(path), ["vertex", "face"])
-    expect(
-        "vertex" in tables and {"x", "y", "z"} <= set(tables["vertex"].numbers),
-        path,
-        "a PLY file with vertices that have x, y and z",
-    )
+    what = "a PLY file with vertices that have x, y and z"
+    expect("vertex" in tables and {"x", "y", "z"} <= set(tables["vertex"].numbers), path, what)
     vertices = _positions(tables["vertex"], "xyz")
     labels = _labels(path, tables["vertex"], zero_is_class=zero_is_class, void=void)
     if "face" not in tables or not tables["face"].count:
@@ -123,11 +120,8 @@ def ids_of(
     Raises:
         FileFormatError: If one is no whole number, or too large.
     """
-    expect(
-        values.dtype.kind != "f" or (np.isfinite(values) & (values == np.floor(values))).all(),
-        where,
-        "whole ids, got others",
-    )
+    whole = values.dtype.kind != "f" or (np.isfinite(values) & (values == np.floor(values))).all()
+    expect(whole, where, "whole ids, got others")
     largest = float(values.max(initial=0))
     expect(largest <= _MAX_ID, where, f"ids up to {_MAX_ID}, got {largest:.0f}")
     ids = torch.from_numpy(values.astype(np.int64)).clamp_min(UNLABELLED)

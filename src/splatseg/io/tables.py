@@ -46,11 +46,6 @@ class _Row:
     colour: tuple[_Byte, _Byte, _Byte] | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class _Table:
-    classes: list[_Row]
-
-
 def class_table(rows: object, *, where: str, keep_zero: bool = False) -> ClassTable:
     """A class table from its JSON rows; ``isthing`` (true) and ``colour`` may lack.
 
@@ -60,7 +55,7 @@ def class_table(rows: object, *, where: str, keep_zero: bool = False) -> ClassTa
         FileFormatError: If a row has no integer id or no name; the message starts with `where`.
     """
     classes: list[ClassInfo] = []
-    for i, row in enumerate(structured({"classes": rows}, _Table, where=where).classes):
+    for i, row in enumerate(structured(rows, list[_Row], where=f"{where}: classes")):
         if keep_zero or row.id != 0:
             with made_from(f"{where}: classes[{i}]"):
                 thing = bool(row.isthing)

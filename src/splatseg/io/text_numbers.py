@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from splatseg.io.foreign import read_lines
-from splatseg.io.schema import expect, malformed
+from splatseg.io.foreign import expect, malformed, read_lines
 
 _BLOCK = 1 << 12
 """Lines whose words are in memory at once."""

@@ -13,8 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from splatseg.io.foreign import reading
-from splatseg.io.schema import expect, malformed
+from splatseg.io.foreign import expect, malformed, reading
 
 _POLYNOMIAL = 0x82F63B78
 _MASK = 0xA282EAD8
@@ -50,11 +49,9 @@ def read_records(path: Path) -> Iterator[bytes]:
             whole = "a whole record, but the file ends early"
             expect(len(head) == _HEAD.size, where, whole)
             length, check = _HEAD.unpack(head)
-            expect(
-                masked_crc32c(head[:8]) == check,
-                where,
-                "the checksum of its length, got another; the file is damaged, or no TFRecord file",
-            )
+            wanted = "the checksum of its length, got another; the file is damaged, or no TFRecord "
+            wanted += "file"
+            expect(masked_crc32c(head[:8]) == check, where, wanted)
             expect(length <= size - stream.tell() - 4, where, whole)
             with reading(path, "a TFRecord file"):
                 content = stream.read(length)

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from splatseg.core.json_values import MAX_NUMBER
 from splatseg.errors import FileFormatError, quoted, reason
-from splatseg.io.foreign import reading
-from splatseg.io.schema import expect, malformed
+from splatseg.io.foreign import expect, malformed, reading
 from splatseg.io.text_numbers import numbers_of
 
 _CHUNK = 1 << 16
@@ -67,9 +66,7 @@ def read_xml(path: Path, kind: str, reader: XmlReader) -> Iterator[None]:
             try:
                 parser.Parse(piece, not piece)
             except expat.ExpatError as error:
-                raise FileFormatError(
-                    f"{path}: expected {kind}, but it cannot be read ({reason(error)})."
-                ) from error
+                raise malformed(path, f"{kind}, but it cannot be read ({reason(error)})") from error
             yield
             if not piece:
                 return

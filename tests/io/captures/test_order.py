@@ -10,7 +10,7 @@ def test_order_of_layouts() -> None:
     )  # fmt: skip
     assert scans.FORMATS == (
         "lidar-npz", "kitti360", "kitti360-sick", "kitti360-points", "semantic-kitti",
-        "kitti-odometry", "kitti-raw", "waymo", "nuscenes", "las", "ply", "npz",
+        "kitti-odometry", "kitti-raw", "waymo", "las", "ply", "npz",
     )  # fmt: skip
 
 

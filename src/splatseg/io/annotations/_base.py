@@ -22,8 +22,7 @@ from splatseg.errors import InputError, quoted
 from splatseg.io.annotations._regions import Canvas, Region, merged
 from splatseg.io.evidence import Evidence
 from splatseg.io.evidence._base import MAX_FILE_ID
-from splatseg.io.foreign import made_from
-from splatseg.io.schema import expect, malformed
+from splatseg.io.foreign import expect, made_from, malformed
 
 AreaKind = Literal["masks", "labels", "panoptic"]
 """What areas can be given as."""
@@ -315,10 +314,9 @@ def _view_of(name: str, files: _Candidates, stems: _Candidates, where: str) -> s
         if shared:
             (best, count), *others = shared.most_common(2)
             if others and others[0][1] == count:
-                raise InputError(
-                    f"{where}: expected names that tell one view, got {quoted(name)}, which may be "
-                    f"{quoted(best)} or {quoted(others[0][0])}."
-                )
+                either = f"{quoted(best)} or {quoted(others[0][0])}"
+                what = f"{where}: expected names that tell one view, got {quoted(name)}, which may"
+                raise InputError(f"{what} be {either}.")
             return best
     return None
 

@@ -26,10 +26,10 @@ from splatseg.io.annotations._base import AnnotatedPicture, Annotations, renumbe
 from splatseg.io.annotations._regions import Canvas, Region, corners_of
 from splatseg.io.atomic import path_inside
 from splatseg.io.evidence._masks import RunLengths
-from splatseg.io.foreign import is_folder, made_from, reading
+from splatseg.io.foreign import expect, is_folder, made_from, malformed, reading
 from splatseg.io.images import open_image
 from splatseg.io.limits import check_unpacked
-from splatseg.io.schema import Name, Side, Whole, expect, malformed, structured
+from splatseg.io.schema import Name, Side, Whole, structured
 
 _FOLDERS = ("panoptic", "panoptic_seg", ".")
 """Where the PNGs of panoptic segments lie beside their JSON, if not in a folder of its name."""

@@ -42,17 +42,12 @@ from PIL import Image
 
 from splatseg.core.json_values import is_json_number
 from splatseg.errors import quoted, reason
-from splatseg.io.annotations._base import (
-    AnnotatedPicture,
-    Annotations,
-    classes_of_names,
-    parts_of,
-)
+from splatseg.io.annotations._base import AnnotatedPicture, Annotations, classes_of_names, parts_of
 from splatseg.io.annotations._regions import Canvas, Region, corners_of
-from splatseg.io.foreign import reading
+from splatseg.io.foreign import expect, malformed, reading
 from splatseg.io.json_files import read_json
 from splatseg.io.limits import check_unpacked
-from splatseg.io.schema import Side, expect, malformed, structured
+from splatseg.io.schema import Side, structured
 from splatseg.io.text_numbers import numbers_of
 from splatseg.io.xml_files import read_xml
 

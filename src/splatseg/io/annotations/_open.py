@@ -27,9 +27,9 @@ from splatseg.io.annotations._drawn import (
 from splatseg.io.evidence import Evidence, LabelEvidence, view_files
 from splatseg.io.evidence._base import HEADER_FILE
 from splatseg.io.evidence._labels import IdRule, Palette
+from splatseg.io.foreign import expect
 from splatseg.io.json_files import read_json_value
 from splatseg.io.label_tables import label_table
-from splatseg.io.schema import expect
 
 _CLASSES = "SegmentationClass"
 _CAMVID = "annot"
@@ -108,11 +108,9 @@ def _of_file(path: Path) -> Annotations:
                 "masks of one view are read with the folder of all views, VIEW.json each."
             )
         return found
-    if suffix in _OF_ONE_VIEW:
-        raise InputError(
-            f"{path}: expected a folder with a file a view, or annotations of all views in one "
-            f"JSON or XML, got one {suffix} file; give the folder."
-        )
+    what = "a folder with a file a view, or annotations of all views in one JSON or XML, got one "
+    what += f"{suffix} file; give the folder"
+    expect(suffix not in _OF_ONE_VIEW, path, what, error=InputError)
     advice = _ADVICE.get(suffix, "docs/models.md has a table of what is read")
     raise InputError(f"{path}: annotations in {suffix or 'such'} files are not read: {advice}.")
 
@@ -174,8 +172,7 @@ _TOOLS = (
     _Tool(
         is_label_studio_min,
         partial(
-            _refuse,
-            "Label Studio's JSON, got JSON-MIN, which lacks the tasks; export JSON or COCO",
+            _refuse, "Label Studio's JSON, got JSON-MIN, which lacks the tasks; export JSON or COCO"
         ),
     ),
     _Tool(is_label_studio, label_studio_annotations),

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from splatseg.core import Rle
 from splatseg.core.json_values import MAX_NUMBER
 from splatseg.errors import quoted
+from splatseg.io.foreign import expect, malformed
 from splatseg.io.limits import check_unpacked
-from splatseg.io.schema import expect, malformed
 
 _BYTES_OF_CROSSING = 48
 """What an edge takes in a row of pixels that it crosses: its number, the row, and where."""

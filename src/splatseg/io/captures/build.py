@@ -17,13 +17,8 @@ from splatseg.core.scene import clean_view_names
 from splatseg.errors import InputError, MissingFileError, quoted
 from splatseg.io.atomic import check_utf8
 from splatseg.io.captures.points import finite_points, read_metadata
-from splatseg.io.captures.raw_views import (
-    RawView,
-    camera_of,
-    intrinsics_of_size,
-    scaled_to,
-)
-from splatseg.io.foreign import is_file, is_folder, made_from
+from splatseg.io.captures.raw_views import RawView, camera_of, intrinsics_of_size, scaled_to
+from splatseg.io.foreign import expect, is_file, is_folder, made_from
 from splatseg.io.images import DEFAULT_LONGEST, IMAGE_SUFFIXES, image_size, reduced_size, same_shape
 
 TEST_EVERY = 8
@@ -174,10 +169,7 @@ def build_capture(
         MissingFileError: If more than half of the photographs are missing, or any with
             `strict`, or masks or depth maps of those that are there.
     """
-    if not raw:
-        raise InputError(
-            f"{path}: expected photographs with poses, got a {format} capture of none."
-        )
+    expect(raw, path, f"photographs with poses, got a {format} capture of none", error=InputError)
     raw, found_notes = _located(path, raw)
     with made_from(path):
         names = view_names([view.relative for view in raw])
@@ -270,10 +262,7 @@ def _located(path: Path, raw: Sequence[RawView]) -> tuple[list[RawView], list[st
 
 def _moved(photographs: Photographs, candidates: Sequence[Path]) -> Path | None:
     """The first of these that is there, None where none is."""
-    for candidate in candidates:
-        if (file := photographs.find(candidate)) is not None:
-            return file
-    return None
+    return next(filter(None, map(photographs.find, candidates)), None)
 
 
 def _cameras(
@@ -330,11 +319,9 @@ def _mask_size(view: RawView, size: tuple[int, int]) -> tuple[int, int]:
     if view.mask is None or not is_file(view.mask):
         return size
     mask = image_size(view.mask)
-    if not same_shape(*size, *mask):
-        raise InputError(
-            f"{view.mask}: expected a mask of {size[0]}x{size[1]} pixels as its photograph has, or "
-            f"a uniform scale of it, got {mask[0]}x{mask[1]}."
-        )
+    what = f"a mask of {size[0]}x{size[1]} pixels as its photograph has, or a uniform scale of it, "
+    what += f"got {mask[0]}x{mask[1]}"
+    expect(same_shape(*size, *mask), view.mask, what, error=InputError)
     return mask
 
 
@@ -357,10 +344,8 @@ def view_names(relatives: Sequence[str]) -> list[str]:
         if not path.name:
             raise InputError(f"photographs: expected the path of a file, got {quoted(relative)}.")
     twice = [str(path) for path, count in Counter(paths).items() if count > 1]
-    if twice:
-        raise InputError(
-            f"photographs: expected each once, got {len(twice)} more than once ({_first(twice)})."
-        )
+    what = f"each once, got {len(twice)} more than once ({_first(twice)})"
+    expect(not twice, "photographs", what, error=InputError)
     parents = [path.parent.parts for path in paths]
     shared = 0
     while all(len(p) > shared and p[shared] == parents[0][shared] for p in parents):

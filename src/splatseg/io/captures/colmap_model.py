@@ -29,8 +29,8 @@ from splatseg.core import CameraModel, PointCloud
 from splatseg.errors import InputError, quoted
 from splatseg.io.captures.points import point_cloud, read_ply_points
 from splatseg.io.captures.raw_views import Intrinsics, pose_of_quaternion
-from splatseg.io.foreign import read_bytes, reading
-from splatseg.io.schema import MAX_SIDE, expect, malformed
+from splatseg.io.foreign import expect, malformed, read_bytes, reading
+from splatseg.io.schema import MAX_SIDE
 
 _POSE = "d" * 7
 _CAMERA_SENSOR = 0
@@ -460,8 +460,5 @@ class _Cursor:
     def finish(self) -> None:
         """Refuse bytes after the last record."""
         more = len(self._data) - self._offset
-        expect(
-            not more,
-            self._path,
-            f"the end of the file at byte {self._offset}, got {more} bytes more: it is corrupt",
-        )
+        what = f"the end of the file at byte {self._offset}, got {more} bytes more: it is corrupt"
+        expect(not more, self._path, what)

@@ -24,10 +24,9 @@ from splatseg.errors import InputError, MissingFileError
 from splatseg.io.captures.build import build_capture
 from splatseg.io.captures.points import point_cloud, vertex_colours
 from splatseg.io.captures.raw_views import Intrinsics, RawView, checked_pose, inverse_pose
-from splatseg.io.foreign import is_folder
+from splatseg.io.foreign import expect, is_folder, malformed
 from splatseg.io.images import find_images
 from splatseg.io.ply import read_ply_vertices, vertex_positions
-from splatseg.io.schema import expect, malformed
 from splatseg.io.text_numbers import (
     keyed_matrix,
     read_keyed_numbers,
@@ -107,11 +106,8 @@ class Drive:
             MissingFileError: If it is missing.
         """
         path = self.root / "calibration" / name
-        if not path.is_file():
-            raise MissingFileError(
-                f"{path}: expected this file of KITTI-360's calibration, got none; it comes in an "
-                "archive of its own."
-            )
+        what = "this file of KITTI-360's calibration, got none; it comes in an archive of its own"
+        expect(path.is_file(), path, what, error=MissingFileError)
         return path
 
     def has(self, frame: int) -> bool:
@@ -215,20 +211,14 @@ def read_poses(drive: Drive) -> dict[int, NDArray[np.float64]]:
     path, of_camera = drive.of(POSES, "poses.txt"), drive.of(POSES, "cam0_to_world.txt")
     camera_from_car = None
     if not path.is_file():
-        if not of_camera.is_file():
-            raise MissingFileError(
-                f"{path}: expected the poses of the drive, got none; photographs and scans without "
-                "poses are of no use."
-            )
+        what = "the poses of the drive, got none; photographs and scans without poses are of no use"
+        expect(of_camera.is_file(), path, what, error=MissingFileError)
         path, camera_from_car = of_camera, np.linalg.inv(camera_pose(drive, "image_00"))
     height = 3 if camera_from_car is None else 4
     found: dict[int, NDArray[np.float64]] = {}
     for i, (frame, *values) in enumerate(read_numbers(path, columns=1 + 4 * height), start=1):
-        expect(
-            0 <= frame <= _MAX_FRAME and frame == int(frame),
-            path,
-            f"a frame first in row {i}, got {frame:g}",
-        )
+        what = f"a frame first in row {i}, got {frame:g}"
+        expect(0 <= frame <= _MAX_FRAME and frame == int(frame), path, what)
         expect(int(frame) not in found, path, f"each frame once, got {int(frame)} twice")
         if not drive.has(int(frame)):
             continue
@@ -323,11 +313,9 @@ def read_kitti360(path: Path, *, strict: bool = False) -> Capture:
     }
     frames = sorted({frame for files in images.values() for frame in files})
     posed = [frame for frame in frames if frame in poses]
-    if not posed:
-        raise InputError(
-            f"{path}: expected photographs with poses, got {len(frames)} frames"
-            f"{drive.frames_in_words} of which none has a pose."
-        )
+    what = f"photographs with poses, got {len(frames)} frames{drive.frames_in_words} of which none "
+    what += "has a pose"
+    expect(posed, path, what, error=InputError)
     split = {frame: "test" if i % 2 else "train" for i, frame in enumerate(posed)}
     raw: list[RawView] = []
     for camera in cameras:
@@ -377,11 +365,9 @@ def _cameras(drive: Drive) -> tuple[str, ...]:
     if drive.part in PERSPECTIVE | FISHEYE:
         return (str(drive.part),)
     found = tuple(c for c in PERSPECTIVE if is_folder(drive.of(PHOTOGRAPHS, c, PERSPECTIVE[c])))
-    if not found:
-        raise MissingFileError(
-            f"{drive.folder}: expected image_00/data_rect or image_01/data_rect, got neither; name "
-            "a fisheye camera, image_02 or image_03, to read that."
-        )
+    what = "image_00/data_rect or image_01/data_rect, got neither; name a fisheye camera, image_02 "
+    what += "or image_03, to read that"
+    expect(found, drive.folder, what, error=MissingFileError)
     return found
 
 

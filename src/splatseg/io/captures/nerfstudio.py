@@ -21,10 +21,10 @@ from splatseg.io.captures.build import build_capture
 from splatseg.io.captures.colmap_model import points_beside, read_points
 from splatseg.io.captures.points import read_ply_points
 from splatseg.io.captures.raw_views import Intrinsics, OfSize, RawView, opencv_from_opengl
-from splatseg.io.foreign import is_file
+from splatseg.io.foreign import expect, is_file, malformed
 from splatseg.io.json_files import read_json
 from splatseg.io.ply import ply_columns
-from splatseg.io.schema import MAX_SIDE, Name, expect, malformed, read_structured, structured
+from splatseg.io.schema import MAX_SIDE, Name, read_structured, structured
 
 FILE = "transforms.json"
 BLENDER_FILE = "transforms_train.json"

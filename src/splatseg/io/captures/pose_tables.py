@@ -17,10 +17,10 @@ from splatseg.io.captures.build import build_capture
 from splatseg.io.captures.colmap_model import points_beside
 from splatseg.io.captures.points import point_cloud, read_ply_points
 from splatseg.io.captures.raw_views import Intrinsics, RawView, inverse_pose
-from splatseg.io.foreign import is_file
+from splatseg.io.foreign import expect, is_file
 from splatseg.io.images import find_images, image_size
 from splatseg.io.ply import read_ply_vertices, vertex_positions
-from splatseg.io.schema import MAX_SIDE, check_array, expect, read_structured
+from splatseg.io.schema import MAX_SIDE, check_array, read_structured
 from splatseg.io.text_numbers import read_numbers
 
 LLFF_FILE = "poses_bounds.npy"
@@ -61,11 +61,9 @@ def read_llff(folder: Path, *, strict: bool = False) -> Capture:
     path = folder / LLFF_FILE
     rows = check_array(path, "rows", read_npy(path), ("n", 17)).astype(np.float64)
     images = next((found for name in _LLFF_FOLDERS if (found := find_images(folder / name))), ())
-    if len(images) != len(rows):
-        raise InputError(
-            f"{path}: expected one row a photograph, got {len(rows)} rows for {len(images)} "
-            "photographs, and rows do not say of which photograph they are."
-        )
+    what = f"one row a photograph, got {len(rows)} rows for {len(images)} photographs, and rows do "
+    what += "not say of which photograph they are"
+    expect(len(images) == len(rows), path, what, error=InputError)
     raw: list[RawView] = []
     for i, (image, row) in enumerate(zip(images, rows, strict=True)):
         down, right, backwards, centre, (height, width, focal) = row[:15].reshape(3, 5).T
@@ -187,10 +185,8 @@ def read_scannet(folder: Path, *, strict: bool = False) -> Capture:
         MissingFileError: If intrinsics, poses or photographs are missing.
         InputError: If a file holds something else.
     """
-    if not find_scannet(folder):
-        raise MissingFileError(
-            f"{folder}: expected {SCANNET_INTRINSICS} and a folder pose, got none."
-        )
+    what = f"{SCANNET_INTRINSICS} and a folder pose, got none"
+    expect(find_scannet(folder), folder, what, error=MissingFileError)
     numbered = sorted(
         (int(path.stem), path)
         for path in (folder / "pose").glob("*.txt")
@@ -388,11 +384,9 @@ def _matrices_of(
     numbers = [int(found[1]) for found in ends if found]
     told = len(set(numbers)) == len(images) > 0 and set(numbers) < set(matrices)
     # Names that begin at 1 could be those of matrices that begin at 0.
-    if not told or min(numbers) != min(matrices):
-        raise InputError(
-            f"{path}: expected one world_mat a photograph, or photographs numbered as they are "
-            f"from the first on, got {len(matrices)} for {len(images)} photographs."
-        )
+    what = "one world_mat a photograph, or photographs numbered as they are from the first on, got "
+    what += f"{len(matrices)} for {len(images)} photographs"
+    expect(told and min(numbers) == min(matrices), path, what, error=InputError)
     return dict(zip(images, numbers, strict=True))
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from splatseg.errors import InputError, MissingPackageError, quoted, reason
 from splatseg.io.captures.raw_views import Intrinsics
+from splatseg.io.foreign import expect
 from splatseg.io.json_files import parse_object
 
 WORST = 0.5
@@ -62,12 +63,10 @@ def lens_by_pycolmap(
     ratio = parameters[0] / parameters[1] if model not in _ONE_FOCAL and parameters[1] else 1.0
     ratio = ratio if 1e-3 < ratio < 1e3 else 1.0
     lens, error = _fitted(plane[sound], pixels[sound], (width, height), ratio=ratio)
-    if not sound.mean() > 0.5 or error > WORST:
-        raise InputError(
-            f"{where}: expected a lens that is within {WORST:g} pixels of one that can be "
-            f"undistorted, got {quoted(model)}, which is {error:.3g} off or sees beyond 90 degrees "
-            "from its axis; undistort the photographs with COLMAP."
-        )
+    what = f"a lens that is within {WORST:g} pixels of one that can be undistorted, got "
+    what += f"{quoted(model)}, which is {error:.3g} off or sees beyond 90 degrees from its axis; "
+    what += "undistort the photographs with COLMAP"
+    expect(sound.mean() > 0.5 and error <= WORST, where, what, error=InputError)
     return lens
 
 
@@ -106,11 +105,7 @@ def _plane(
 
 
 def _fitted(
-    plane: NDArray[np.float64],
-    pixels: NDArray[np.float64],
-    size: tuple[int, int],
-    *,
-    ratio: float,
+    plane: NDArray[np.float64], pixels: NDArray[np.float64], size: tuple[int, int], *, ratio: float
 ) -> tuple[Intrinsics, float]:
     """The lens of `core.lenses` nearest to these pixels, and pixels it is off at most.
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from splatseg.core import Camera, CameraModel
 from splatseg.core.json_values import MAX_NUMBER
 from splatseg.errors import InputError, quoted
+from splatseg.io.foreign import expect
 from splatseg.io.images import same_shape
 from splatseg.io.schema import MAX_SIDE
 
@@ -120,11 +121,9 @@ def checked_pose(pose: NDArray[np.float64], *, where: str) -> NDArray[np.float64
     rotation = pose[:3, :3]
     error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
     determinant = float(np.linalg.det(rotation))
-    if error > _ROTATION_TOLERANCE or determinant < 0:
-        raise InputError(
-            f"{where}: expected a rotation in its pose, got a matrix with |R R^T - I| = "
-            f"{error:.3g} and determinant {determinant:.3g}."
-        )
+    what = f"a rotation in its pose, got a matrix with |R R^T - I| = {error:.3g} and determinant "
+    what += f"{determinant:.3g}"
+    expect(error <= _ROTATION_TOLERANCE and determinant >= 0, where, what, error=InputError)
     if np.abs(pose[3] - [0, 0, 0, 1]).max() > _ROTATION_EXACT:
         raise InputError(f"{where}: expected a pose whose last row is 0 0 0 1, got {pose[3]}.")
     exact = pose.copy()

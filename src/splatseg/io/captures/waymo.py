@@ -30,10 +30,10 @@ from splatseg.io.captures.waymo_tfrecord import (
     context_of,
     unpack_components,
 )
-from splatseg.io.foreign import is_file
+from splatseg.io.foreign import expect, is_file
 from splatseg.io.json_files import read_json, write_json
 from splatseg.io.parquet import Row, RowReader, bytes_of, integer_of, list_of, number_of, read_rows
-from splatseg.io.schema import MAX_SIDE, expect
+from splatseg.io.schema import MAX_SIDE
 
 IMAGES = "camera_image"
 LIDAR = "lidar"
@@ -196,16 +196,11 @@ def one_segment(path: Path) -> WaymoSegment:
     if path.suffix == ENDING:
         unpack_components(path)
     found = find_segments(path)
-    if not found:
-        raise MissingFileError(
-            f"{path}: expected segments of Waymo, {IMAGES}/CONTEXT{SUFFIX} and further components, "
-            "got none."
-        )
-    if len(found) > 1:
-        raise InputError(
-            f"{path}: expected one segment, got {len(found)}; name one by its file, such as "
-            f"{found[0].component(IMAGES)}."
-        )
+    what = f"segments of Waymo, {IMAGES}/CONTEXT{SUFFIX} and further components, got none"
+    expect(found, path, what, error=MissingFileError)
+    what = f"one segment, got {len(found)}; name one by its file, such as "
+    what += f"{found[0].component(IMAGES)}"
+    expect(len(found) <= 1, path, what, error=InputError)
     return next(iter(found))
 
 

@@ -19,11 +19,10 @@ from numpy.typing import NDArray
 
 from splatseg.errors import SplatsegError
 from splatseg.io.atomic import atomic_folder, sweep
-from splatseg.io.foreign import reading
+from splatseg.io.foreign import expect, malformed, reading
 from splatseg.io.json_files import read_json, write_json
 from splatseg.io.limits import check_unpacked, max_unpacked
 from splatseg.io.parquet import RowWriter, writing_rows
-from splatseg.io.schema import expect, malformed
 from splatseg.io.tfrecord import Message, packed_integers, parse_message, read_records
 
 ENDING = ".tfrecord"
@@ -103,16 +102,14 @@ def _packed(message: Message, number: int, where: str) -> bytes:
 
 
 def _text(message: Message, number: int, where: str) -> str:
-    name = message.get(number, [b""])[-1]
-    return name.decode(errors="replace") if isinstance(name, bytes) else ""
+    return _packed(message, number, where).decode(errors="replace")
 
 
 def _lens(index: int) -> "Callable[[Message, int, str], float]":
     def take(message: Message, number: int, where: str) -> float:
         numbers = _doubles(message, number, where)
-        expect(
-            len(numbers) == len(LENS), where, f"{len(LENS)} numbers of a lens, got {len(numbers)}"
-        )
+        what = f"{len(LENS)} numbers of a lens, got {len(numbers)}"
+        expect(len(numbers) == len(LENS), where, what)
         return float(numbers[index])
 
     return take

@@ -26,7 +26,8 @@ from splatseg.errors import InputError
 from splatseg.io.arrays import read_npz
 from splatseg.io.depths import depth_kind, read_depth_map
 from splatseg.io.evidence._base import EvidenceKind, FileEvidence
-from splatseg.io.schema import check_array, expect
+from splatseg.io.foreign import expect
+from splatseg.io.schema import check_array
 
 QUANTISATION_FILE = "quant.npz"
 BASIS_FILE = "basis.npz"
@@ -227,17 +228,14 @@ def features_content(what: str, features: FeatureMap | DeepFeatures) -> dict[str
     found = _map_content(what, deepest, "")
     if len(features.maps) == 1 and token is None:
         return found
-    if len(set(features.depths)) != len(features.depths):
-        raise InputError(
-            f"{what}: expected depths of different names, got {', '.join(features.depths)}."
-        )
+    wanted = f"depths of different names, got {', '.join(features.depths)}"
+    expect(len(set(features.depths)) == len(features.depths), what, wanted, error=InputError)
     found[_BLOCKS] = np.array(features.depths)
     for i, one in enumerate(features.maps[:-1]):
-        if (one.height, one.width) != (deepest.height, deepest.width):
-            raise InputError(
-                f"{what}: expected maps of one image of {deepest.width}x{deepest.height}, got one "
-                f"of {one.width}x{one.height}."
-            )
+        wanted = f"maps of one image of {deepest.width}x{deepest.height}, got one of "
+        wanted += f"{one.width}x{one.height}"
+        same = (one.height, one.width) == (deepest.height, deepest.width)
+        expect(same, what, wanted, error=InputError)
         content = _map_content(what, one, f"_{i}")
         del content[f"size_{i}"]
         found |= content
@@ -309,9 +307,8 @@ def _finite(path: Path, name: str, values: NDArray[Any]) -> NDArray[Any]:
     """An array, if it holds numbers none of which is NaN or infinite."""
     expect(values.dtype.kind in "fiu", path, f"{name} as numbers, got {values.dtype}")
     bad = values.size - int(np.isfinite(values).sum())
-    expect(
-        not bad, path, f"finite {name}, got {bad} of {values.size} values that are NaN or infinite"
-    )
+    what = f"finite {name}, got {bad} of {values.size} values that are NaN or infinite"
+    expect(not bad, path, what)
     return values
 
 
@@ -333,11 +330,9 @@ class TextEmbeddings:
         Raises:
             InputError: If there is none.
         """
-        if label not in self.labels:
-            raise InputError(
-                f"text: expected one of the {len(self.labels)} recorded words "
-                f"({', '.join(self.labels[:5])}, ...), got {label!r}."
-            )
+        what = f"one of the {len(self.labels)} recorded words ({', '.join(self.labels[:5])}, ...), "
+        what += f"got {label!r}"
+        expect(label in self.labels, "text", what, error=InputError)
         return self.vectors[self.labels.index(label)]
 
 

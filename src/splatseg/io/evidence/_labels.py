@@ -26,10 +26,9 @@ from splatseg.io.evidence._base import (
     EvidenceKind,
     FileEvidence,
 )
-from splatseg.io.foreign import reading
+from splatseg.io.foreign import expect, malformed, reading
 from splatseg.io.images import left_out_pixels, open_image
 from splatseg.io.limits import check_unpacked
-from splatseg.io.schema import expect, malformed
 
 SOFT_NAMES = ("probabilities", "logits")
 """Arrays of an npz that is a soft map."""

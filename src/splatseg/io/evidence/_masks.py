@@ -21,10 +21,10 @@ from splatseg.errors import reason
 from splatseg.io.arrays import npz_names, read_npy, read_npz
 from splatseg.io.evidence._base import EvidenceKind, FileEvidence
 from splatseg.io.evidence._labels import read_id_map
-from splatseg.io.foreign import made_from
+from splatseg.io.foreign import expect, made_from, malformed
 from splatseg.io.json_files import read_json_value
 from splatseg.io.limits import check_unpacked
-from splatseg.io.schema import Side, check_array, expect, malformed, structured
+from splatseg.io.schema import Side, check_array, structured
 
 MASK_TABLE = "metadata.csv"
 """What SAM's tool writes beside the pictures of masks of one photograph."""

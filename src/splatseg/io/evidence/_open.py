@@ -30,9 +30,10 @@ from splatseg.io.evidence._features import (
 from splatseg.io.evidence._labels import LABEL_NAMES, IdRule, LabelEvidence, Palette, is_soft
 from splatseg.io.evidence._masks import MaskEvidence, holds_mask_rows, holds_masks, mask_folders
 from splatseg.io.evidence._segments import SEGMENTS_FILE, TRACKS_FILE, open_tables
+from splatseg.io.foreign import expect
 from splatseg.io.json_files import read_json, read_json_value
 from splatseg.io.label_tables import LabelTable, label_table, training_table
-from splatseg.io.schema import expect, structured
+from splatseg.io.schema import structured
 from splatseg.io.tables import class_table
 
 FORMAT = "splatseg-evidence"
@@ -269,10 +270,7 @@ def _check_finished(folder: Path, header: Mapping[str, Any], *, views: int) -> N
 
 
 def _kind(
-    folder: Path,
-    maps: Mapping[str, Path],
-    objects: Mapping[str, Path],
-    arrays: Mapping[str, Path],
+    folder: Path, maps: Mapping[str, Path], objects: Mapping[str, Path], arrays: Mapping[str, Path]
 ) -> str | None:
     """The kind that files without a header show; the first one must hold what its kind has."""
     if maps and mask_folders(folder, marked_by="metadata.csv"):

@@ -24,8 +24,9 @@ from splatseg.core.boundary import boundary
 from splatseg.core.json_values import id_of_key
 from splatseg.io.evidence._base import MAX_FILE_ID, Evidence, EvidenceKind
 from splatseg.io.evidence._labels import LabelEvidence, check_size, masks_of_ids
+from splatseg.io.foreign import malformed
 from splatseg.io.json_files import read_json
-from splatseg.io.schema import Whole, malformed, structured
+from splatseg.io.schema import Whole, structured
 
 SEGMENTS_FILE = "segments.json"
 TRACKS_FILE = "tracks.json"

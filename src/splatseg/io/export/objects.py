@@ -441,9 +441,7 @@ _COLUMNS = (
 
 
 @boundary
-def write_node_table(
-    tree: InstanceTree, path: Path, *, about: Mapping[str, Any] | None = None
-) -> None:
+def write_node_table(tree: InstanceTree, path: Path) -> None:
     """Write the nodes of a tree; atomic. The ending, .csv or .json, gives the format.
 
     A row has the id of the parent (0 for none), the level, the granularity in [0, 1], and how
@@ -452,7 +450,6 @@ def write_node_table(
     Args:
         tree: The tree.
         path: The file.
-        about: Further members of the JSON. CSV has no place for them.
 
     Raises:
         InputError: If the name ends otherwise.
@@ -460,7 +457,7 @@ def write_node_table(
     """
     rows = node_rows(tree)
     cells = [[row[column] for column in _COLUMNS] for row in rows]
-    _write_table(path, dict(about or {}) | {"nodes": rows}, _COLUMNS, cells)
+    _write_table(path, {"nodes": rows}, _COLUMNS, cells)
 
 
 @boundary

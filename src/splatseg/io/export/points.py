@@ -16,7 +16,7 @@ from torch import Tensor
 from splatseg._check import check_choice, check_finite, check_shape
 from splatseg.core import UNLABELLED, Gaussians, PointLabels, Scan
 from splatseg.core.boundary import boundary
-from splatseg.errors import InputError, MissingPackageError, RangeError
+from splatseg.errors import InputError, RangeError, import_package
 from splatseg.io.atomic import atomic_file, atomic_folder, path_inside
 from splatseg.io.export.objects import MADE_BY
 from splatseg.io.export.splats import check_replaceable
@@ -206,19 +206,10 @@ def _write_las(
 
 def _laspy(path: Path) -> Any:
     """The module that writes LAS, and for LAZ its compressor, or a word on how to get them."""
-    missing = "laspy"
-    try:
-        import laspy
-
-        if path.suffix.lower() == ".laz":
-            missing = "lazrs"
-            import lazrs  # noqa: F401  # pyright: ignore[reportUnusedImport]
-    except ImportError as error:
-        raise MissingPackageError(
-            f"{path}: {path.suffix[1:].upper()} needs a package that is not installed "
-            f"({missing}). Try: pip install 'splatseg[las]'."
-        ) from error
-    return laspy
+    what = f"{path}: {path.suffix[1:].upper()}"
+    if path.suffix.lower() == ".laz":
+        import_package("lazrs", what, "las")
+    return import_package("laspy", what, "las")
 
 
 ScanLabelForm = Literal["npz", "label", "ply", "las"]

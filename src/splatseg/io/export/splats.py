@@ -27,6 +27,7 @@ from splatseg.io.atomic import (
     sweep,
 )
 from splatseg.io.export.objects import MADE_BY, ObjectRow, object_content
+from splatseg.io.foreign import expect
 from splatseg.io.json_files import read_json, write_json
 from splatseg.io.splats import SplatWarning, WritableFormat, write_splats
 
@@ -45,11 +46,10 @@ def check_replaceable(path: Path, record: str) -> None:
     if path.exists() and not path.is_dir():
         raise InputError(f"{path}: expected a folder to write to, got a file.")
     check_parent(path)
-    if path.is_dir() and not is_vacant(path) and not is_ours(path / record):
-        raise InputError(
-            f"{path}: expected a new or empty folder or one that an earlier export made, got one "
-            "with other files; choose another."
-        )
+    what = "a new or empty folder or one that an earlier export made, got one with other files; "
+    what += "choose another"
+    ours = not path.is_dir() or is_vacant(path) or is_ours(path / record)
+    expect(ours, path, what, error=InputError)
 
 
 @boundary
@@ -167,11 +167,9 @@ def check_beside(path: Path) -> Path:
         InputError: If a file is there that no export wrote.
     """
     beside = path.with_suffix(".json")
-    if beside.exists() and not is_ours(beside):
-        raise InputError(
-            f"{beside}: expected no file or a table of an earlier export, for what the ids mean; "
-            f"choose another name than {path.name}."
-        )
+    what = "no file or a table of an earlier export, for what the ids mean; choose another name "
+    what += f"than {path.name}"
+    expect(not beside.exists() or is_ours(beside), beside, what, error=InputError)
     return beside
 
 

@@ -15,9 +15,8 @@ from splatseg.core import ClassInfo, ClassTable
 from splatseg.errors import FileFormatError as FileFormatError
 from splatseg.errors import InputError
 from splatseg.errors import quoted as quoted
-from splatseg.io.foreign import read_lines
+from splatseg.io.foreign import malformed, read_lines
 from splatseg.io.json_files import read_json
-from splatseg.io.schema import malformed
 from splatseg.io.tables import class_table
 
 TABLES = ("ade20k", "coco", "cityscapes", "scannet", "kitti360", "semantic-kitti", "voc")

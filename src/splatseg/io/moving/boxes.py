@@ -46,11 +46,11 @@ from splatseg.io.captures.waymo import (
     one_segment,
 )
 from splatseg.io.captures.waymo_tfrecord import ENDING
-from splatseg.io.foreign import is_file, is_folder, made_from
+from splatseg.io.foreign import expect, is_file, is_folder, made_from, malformed
 from splatseg.io.json_files import read_json, write_json
 from splatseg.io.moving.views import CLOCKS, Clock
 from splatseg.io.parquet import Row, integer_of, number_of, read_rows
-from splatseg.io.schema import expect, malformed, structured
+from splatseg.io.schema import structured
 from splatseg.io.text_numbers import frame_time, read_times, time_at
 from splatseg.io.xml_files import StoredObject, stored_objects
 

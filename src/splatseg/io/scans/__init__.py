@@ -15,7 +15,7 @@ from splatseg.core import ClassTable
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, MissingFileError
 from splatseg.io.captures.kitti360 import window_of
-from splatseg.io.scans import files, kitti, kitti360, nuscenes, waymo
+from splatseg.io.scans import files, kitti, kitti360, waymo
 from splatseg.io.scans._source import Scans as Scans
 
 
@@ -45,7 +45,6 @@ LAYOUTS = (
     Layout("kitti-odometry", kitti.find_odometry, kitti.read_odometry),
     Layout("kitti-raw", kitti.find_kitti_raw, kitti.read_kitti_raw),
     Layout("waymo", waymo.find_waymo_scans, waymo.read_waymo_scans),
-    Layout("nuscenes", nuscenes.find_nuscenes, nuscenes.read_nuscenes),
     # Files of points come last: they may lie in the folder of any data set.
     *(_files(format) for format in ("las", "ply", "npz")),
 )

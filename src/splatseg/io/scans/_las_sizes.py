@@ -6,17 +6,15 @@ million of them; lazrs allocates what it is told, and ends the process where tha
 Specification 1.4 R15; Isenburg, LASzip (2013), and its format's layers.
 """
 
-import importlib
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from splatseg.errors import MissingPackageError
-from splatseg.io.foreign import reading
+from splatseg.errors import import_package
+from splatseg.io.foreign import expect, reading
 from splatseg.io.limits import check_unpacked
-from splatseg.io.schema import expect
 
 _HEADER = 227
 _POINT_BYTES = {
@@ -172,13 +170,7 @@ def _chunks(
     path: Path, file: BinaryIO, sizes: _Sizes, record: bytes, chunk: int
 ) -> list[tuple[int, int]]:
     """Points and bytes of each chunk. The table is compressed, and its length is known by now."""
-    try:
-        lazrs = importlib.import_module("lazrs")
-    except ImportError as error:
-        raise MissingPackageError(
-            f"{path}: compressed points need a package that is not installed (lazrs). Try: pip "
-            "install 'splatseg[las]'."
-        ) from error
+    lazrs = import_package("lazrs", f"{path}: LASzip", "las")
     file.seek(sizes.data)
     chunks = [(int(n), int(size)) for n, size in lazrs.read_chunk_table(file, lazrs.LazVlr(record))]
     held = chunk * len(chunks) if chunk != _ANY_SIZE else sum(n for n, _ in chunks)

@@ -22,8 +22,7 @@ from splatseg.core import UNLABELLED, ClassTable
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.scans import Scan
 from splatseg.errors import InputError
-from splatseg.io.foreign import made_from, read_bytes
-from splatseg.io.schema import expect, malformed
+from splatseg.io.foreign import expect, made_from, malformed, read_bytes
 
 MAX_ID = 2**31 - 2
 PIECE = 1_000_000
@@ -120,7 +119,7 @@ def build_scan(name: str, raw: RawScan, classes: ClassTable | None) -> Scan:
     """Check what a reader found and make the scan of it.
 
     Values without a return are left out; those at the sensor itself are such, where points are
-    in its axes: KITTI and nuScenes write them so. NaN and infinity are damage, not "no return".
+    in its axes: KITTI writes them so. NaN and infinity are damage, not "no return".
 
     Raises:
         FileFormatError: If a value is NaN or infinite, or labels do not fit.
@@ -129,13 +128,10 @@ def build_scan(name: str, raw: RawScan, classes: ClassTable | None) -> Scan:
     recorded = len(points)
     kept = np.ones(recorded, np.bool_) if raw.missing is None else ~raw.missing
     finite = np.isfinite(points).all(axis=1) | ~kept
-    expect(
-        finite.all(),
-        raw.where,
-        f"finite positions, got {int((~finite).sum())} of {recorded} that are NaN or infinite, the "
-        f"first at point {int(np.argmin(finite)) if recorded else 0}; a ray without a return has "
-        "a range of 0",
-    )
+    what = f"finite positions, got {int((~finite).sum())} of {recorded} that are NaN or infinite, "
+    what += f"the first at point {int(np.argmin(finite)) if recorded else 0}; a ray without a "
+    what += "return has a range of 0"
+    expect(finite.all(), raw.where, what)
     pose = raw.world_from_sensor
     if pose is not None:
         kept = kept & points.any(axis=1)

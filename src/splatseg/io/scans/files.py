@@ -21,15 +21,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splatseg.errors import MissingFileError, MissingPackageError
+from splatseg.errors import MissingFileError, import_package
 from splatseg.io.arrays import npz_names, read_npy, read_npz
 from splatseg.io.captures import read_metadata
 from splatseg.io.captures.raw_views import checked_pose
-from splatseg.io.foreign import reading
+from splatseg.io.foreign import expect, malformed, reading
 from splatseg.io.ply import PlyHeader, read_ply_header, read_ply_tables
 from splatseg.io.scans._las_sizes import check_las_sizes
 from splatseg.io.scans._source import Piece, RawScan, Scans, read_in_pieces, refuse_twice
-from splatseg.io.schema import check_array, expect, malformed
+from splatseg.io.schema import check_array
 
 SUFFIXES = {".las": "las", ".laz": "las", ".ply": "ply", ".npz": "npz", ".npy": "npz"}
 """Formats by the endings of their files."""
@@ -196,18 +196,10 @@ def _las_points(path: Path) -> Piece:
 @contextmanager
 def _open_las(path: Path) -> Generator[Any]:
     """A reader of laspy, whose failures are ours."""
-    missing = "laspy"
-    try:
-        import laspy
-
-        if path.suffix.lower() == ".laz":
-            missing = "lazrs"
-            import lazrs  # noqa: F401  # pyright: ignore[reportUnusedImport]
-    except ImportError as error:
-        raise MissingPackageError(
-            f"{path}: {path.suffix[1:].upper()} needs a package that is not installed "
-            f"({missing}). Try: pip install 'splatseg[las]'."
-        ) from error
+    what = f"{path}: {path.suffix[1:].upper()}"
+    laspy = import_package("laspy", what, "las")
+    if path.suffix.lower() == ".laz":
+        import_package("lazrs", what, "las")
     check_las_sizes(path)
     with reading(path, _LAS), path.open("rb") as file:
         try:

@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from splatseg.errors import InputError, MissingFileError
 from splatseg.io.captures.raw_views import checked_pose
-from splatseg.io.foreign import read_lines
+from splatseg.io.foreign import expect, malformed, read_lines
 from splatseg.io.label_tables import label_table
 from splatseg.io.scans._source import (
     RawScan,
@@ -35,7 +35,6 @@ from splatseg.io.scans._source import (
     read_records,
     skipped,
 )
-from splatseg.io.schema import malformed
 from splatseg.io.text_numbers import (
     keyed_matrix,
     numbers_of,
@@ -90,21 +89,16 @@ def read_kitti_raw(path: Path) -> Scans:
         InputError: If there are several recordings, a file is broken, or no scan has a packet.
     """
     found = _recordings(path)
-    if not found:
-        raise MissingFileError(
-            f"{path}: expected a recording of KITTI, with {_SCANS.as_posix()} and "
-            f"{_UNIT.as_posix()}, got none."
-        )
+    what = f"a recording of KITTI, with {_SCANS.as_posix()} and {_UNIT.as_posix()}, got none"
+    expect(found, path, what, error=MissingFileError)
     folders = {folder.name: folder for folder in found}
     folder = folders[only_one(path, list(folders), "recording")]
     files = numbered_files(folder / _SCANS, ".bin")
     packets = numbered_files(folder / _UNIT, ".txt")
     posed = [name for name in files if name in packets]
-    if not posed:
-        raise InputError(
-            f"{path}: expected scans with poses, got {len(files)} scans and {len(packets)} packets "
-            "of the inertial unit, none of the same frame."
-        )
+    what = f"scans with poses, got {len(files)} scans and {len(packets)} packets of the inertial "
+    what += "unit, none of the same frame"
+    expect(posed, path, what, error=InputError)
     unit_from_scanner = np.linalg.inv(_scanner_from_unit(folder))
     first = _packet(packets[next(iter(packets))])
     times = read_times(folder / "velodyne_points" / "timestamps.txt")
@@ -164,11 +158,9 @@ def _packet(path: Path) -> NDArray[np.float64]:
 def _scanner_from_unit(folder: Path) -> NDArray[np.float64]:
     places = (folder.absolute().parent / _CALIBRATION, folder / _CALIBRATION)
     path = next((place for place in places if place.is_file()), places[0])
-    if not path.is_file():
-        raise MissingFileError(
-            f"{path}: expected this file of KITTI's calibration, got none; each day has its own, "
-            "in an archive of its own."
-        )
+    what = "this file of KITTI's calibration, got none; each day has its own, in an archive of its "
+    what += "own"
+    expect(path.is_file(), path, what, error=MissingFileError)
     rows = read_keyed_numbers(path)
     turn = keyed_matrix(rows, "R", (3, 3), path=path)
     moved = keyed_matrix(rows, "T", (3, 1), path=path)
@@ -207,11 +199,8 @@ def read_semantic_kitti(path: Path) -> Scans:
         MissingFileError: If there is no sequence with labels, or poses or calibration lack.
         InputError: If there are several sequences, or a file is broken.
     """
-    if not find_semantic_kitti(path):
-        raise MissingFileError(
-            f"{path}: expected a sequence of SemanticKITTI, with {_SEQUENCE_SCANS}, {_LABELS} and "
-            "calib.txt, got none."
-        )
+    what = f"a sequence of SemanticKITTI, with {_SEQUENCE_SCANS}, {_LABELS} and calib.txt, got none"
+    expect(find_semantic_kitti(path), path, what, error=MissingFileError)
     return _read_sequence(path, "semantic-kitti")
 
 
@@ -222,11 +211,8 @@ def read_odometry(path: Path) -> Scans:
         MissingFileError: If there is no sequence, or poses or calibration lack.
         InputError: If there are several sequences, or a file is broken.
     """
-    if not find_odometry(path):
-        raise MissingFileError(
-            f"{path}: expected a sequence of KITTI's odometry, with {_SEQUENCE_SCANS} and "
-            "calib.txt, got none."
-        )
+    what = f"a sequence of KITTI's odometry, with {_SEQUENCE_SCANS} and calib.txt, got none"
+    expect(find_odometry(path), path, what, error=MissingFileError)
     return _read_sequence(path, "kitti-odometry")
 
 
@@ -236,10 +222,8 @@ def _read_sequence(path: Path, format: str) -> Scans:
     files = numbered_files(folder / _SEQUENCE_SCANS, ".bin")
     poses = _sequence_poses(folder)
     posed = [name for name in files if int(name) < len(poses)]
-    if not posed:
-        raise InputError(
-            f"{path}: expected scans with poses, got {len(files)} scans and {len(poses)} poses."
-        )
+    what = f"scans with poses, got {len(files)} scans and {len(poses)} poses"
+    expect(posed, path, what, error=InputError)
     labelled = format == "semantic-kitti"
     clock = folder / "times.txt"
     times = read_numbers(clock, columns=1)[:, 0] if clock.is_file() else None
@@ -296,11 +280,9 @@ def _sequence_poses(folder: Path) -> list[NDArray[np.float64]]:
     above = folder.absolute().parents
     places = (folder / "poses.txt", *(parent / "poses" / name for parent in above[:3]))
     path = next((place for place in places if place.is_file()), places[0])
-    if not path.is_file():
-        raise MissingFileError(
-            f"{path}: expected the poses of the sequence, there or in poses/{name} above it, got "
-            "none; scans without poses are of no use."
-        )
+    what = f"the poses of the sequence, there or in poses/{name} above it, got none; scans without "
+    what += "poses are of no use"
+    expect(path.is_file(), path, what, error=MissingFileError)
     calibration = folder / "calib.txt"
     matrix = rigid(keyed_matrix(read_keyed_numbers(calibration), "Tr", (3, 4), path=calibration))
     camera_from_scanner = checked_pose(matrix, where=f"{calibration}: Tr")

@@ -30,6 +30,7 @@ from splatseg.io.captures.kitti360 import (
     static_windows,
     velodyne_pose,
 )
+from splatseg.io.foreign import expect
 from splatseg.io.label_tables import label_table
 from splatseg.io.scans._source import (
     RawScan,
@@ -41,7 +42,6 @@ from splatseg.io.scans._source import (
 )
 from splatseg.io.scans.files import ply_pieces, positions, whole_ids
 from splatseg.io.scans.kitti import read_points
-from splatseg.io.schema import expect
 from splatseg.io.text_numbers import read_times, time_at
 
 _MAX_GAP = 3
@@ -145,10 +145,8 @@ def read_sick(path: Path) -> Scans:
         _needed_times(drive.of(SCANS, sensor, "timestamps.txt")) for sensor in (SICK, VELODYNE)
     )
     poses = {f: p for f, p in read_poses(drive).items() if np.isfinite(time_at(frames, f))}
-    if len(poses) < 2:
-        raise InputError(
-            f"{path}: expected at least two frames with a pose and a time, got {len(poses)}."
-        )
+    what = f"at least two frames with a pose and a time, got {len(poses)}"
+    expect(len(poses) >= 2, path, what, error=InputError)
     numbers = sorted(poses, key=lambda frame: float(frames[frame]))
     moments = np.array([float(frames[frame]) for frame in numbers])
     where = drive.of(SCANS, VELODYNE, "timestamps.txt")
@@ -194,11 +192,9 @@ def read_accumulated(path: Path) -> Scans:
     """
     drive = drive_at(path)
     windows = static_windows(drive, part=_part(drive))
-    if not windows:
-        raise MissingFileError(
-            f"{path}: expected accumulated points, {ACCUMULATED}/train/{drive.name}/"
-            f"{_part(drive)}/START_END.ply, got none."
-        )
+    what = f"accumulated points, {ACCUMULATED}/train/{drive.name}/{_part(drive)}/START_END.ply, "
+    what += "got none"
+    expect(windows, path, what, error=MissingFileError)
     names, piece = read_in_pieces(windows.values(), ply_pieces)
 
     def read(name: str) -> RawScan:
@@ -251,11 +247,9 @@ def _files(drive: Drive, sensor: str) -> dict[str, Path]:
 def _posed(
     drive: Drive, path: Path, files: Mapping[str, Path], posed: Sequence[str]
 ) -> tuple[str, ...]:
-    if not posed:
-        raise InputError(
-            f"{path}: expected scans with poses, got {len(files)} scans{drive.frames_in_words} of "
-            "which none has a pose."
-        )
+    what = f"scans with poses, got {len(files)} scans{drive.frames_in_words} of which none has a "
+    what += "pose"
+    expect(posed, path, what, error=InputError)
     return tuple(posed)
 
 

@@ -31,10 +31,10 @@ from splatseg.io.captures.waymo import (
     transform,
 )
 from splatseg.io.captures.waymo_tfrecord import ENDING
+from splatseg.io.foreign import expect, malformed
 from splatseg.io.parquet import Row, RowReader, integer_of, list_of, number_of, read_rows
 from splatseg.io.scans._source import RawScan, Scans, refuse_twice
 from splatseg.io.scans.files import directions
-from splatseg.io.schema import expect, malformed
 
 CALIBRATIONS = "lidar_calibration"
 POSES = "lidar_pose"

@@ -65,11 +65,7 @@ _WRITERS: Mapping[WritableFormat, _Writer] = {
     "compressed.ply": _Writer(
         "a compressed PLY file", write_compressed_ply, ("antialiased", "low_pass")
     ),
-    "ply": _Writer(
-        "a PLY file",
-        write_ply,
-        ("extra", "antialiased", "low_pass"),
-    ),
+    "ply": _Writer("a PLY file", write_ply, ("extra", "antialiased", "low_pass")),
     "splat": _Writer("a .splat file", write_splat),
     "spz": _Writer("an SPZ file", partial(write_spz, version=4), ("antialiased",)),
     "spz3": _Writer("an SPZ file", partial(write_spz, version=3), ("antialiased",)),
@@ -123,10 +119,8 @@ def read_splats(
     format = splat_format(source)
     if format == "ply":
         return read_ply(source, read_ply_header(source), strict=strict, linear=linear)
-    if linear:
-        raise InputError(
-            f"linear: expected a PLY file of 3DGS, whose values may be logs or not, got {source}."
-        )
+    what = f"a PLY file of 3DGS, whose values may be logs or not, got {source}"
+    expect(not linear, "linear", what, error=InputError)
     return _READERS[format](source, strict=strict)
 
 

@@ -29,9 +29,7 @@ def assemble(largest: NDArray[np.integer], others: NDArray[np.floating]) -> NDAr
     return result
 
 
-def split(
-    rotations: NDArray[np.float32],
-) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+def split(rotations: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
     """The inverse of `assemble` for unit quaternions; the sign is chosen so that it holds."""
     largest = np.abs(rotations).argmax(axis=1)
     sign = np.sign(np.take_along_axis(rotations, largest[:, None], axis=1))

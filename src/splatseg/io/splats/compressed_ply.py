@@ -113,11 +113,8 @@ def _elements(path: Path, header: PlyHeader) -> tuple[PlyElement, PlyElement, Pl
     """The vertex, chunk and sh elements, checked."""
     vertex, chunk, sh = (header.element(name) for name in ("vertex", "chunk", "sh"))
     lists = any(one.lists for one in header.elements)
-    expect(
-        header.order and not lists,
-        path,
-        "a compressed PLY file in binary and without lists, got another",
-    )
+    what = "a compressed PLY file in binary and without lists, got another"
+    expect(header.order and not lists, path, what)
     if vertex is None or chunk is None:
         names = quoted(", ".join(one.name for one in header.elements) or "none")
         raise FileFormatError(
@@ -127,18 +124,13 @@ def _elements(path: Path, header: PlyHeader) -> tuple[PlyElement, PlyElement, Pl
     coloured = any(name in chunk.names for name in _MIN_MAX[12:])
     _check_columns(path, chunk, _MIN_MAX if coloured else _MIN_MAX[:12], "f4")
     chunks = -(-vertex.count // CHUNK)
-    expect(
-        chunk.count == chunks,
-        path,
-        f"{chunks} chunks for {vertex.count} Gaussians, got {chunk.count}",
-    )
+    what = f"{chunks} chunks for {vertex.count} Gaussians, got {chunk.count}"
+    expect(chunk.count == chunks, path, what)
     if sh is not None:
         known = [3 * ((degree + 1) ** 2 - 1) for degree in range(1, MAX_DEGREE + 1)]
-        expect(
-            len(sh.names) in known and sh.count == vertex.count,
-            path,
-            f"{vertex.count} rows of 9, 24 or 45 harmonics, got {sh.count} rows of {len(sh.names)}",
-        )
+        what = f"{vertex.count} rows of 9, 24 or 45 harmonics, got {sh.count} rows of "
+        what += f"{len(sh.names)}"
+        expect(len(sh.names) in known and sh.count == vertex.count, path, what)
         expected = tuple(f"f_rest_{i}" for i in range(len(sh.names)))
         _check_columns(path, sh, expected, "u1")
         expect(sh.names == expected, path, "the harmonics f_rest_0, ... in order")
@@ -150,12 +142,9 @@ def _check_columns(path: Path, element: PlyElement, names: tuple[str, ...], code
     codes = {one.name: one.code for one in element.properties}
     wrong = [name for name in names if codes.get(name) != code]
     listed, got = quoted(", ".join(wrong), 100), quoted(", ".join(codes), 100)
-    expect(
-        not wrong,
-        path,
-        f"the columns {listed} of type {np.dtype(code)} in the element {quoted(element.name)}, "
-        f"got {got}",
-    )
+    what = f"the columns {listed} of type {np.dtype(code)} in the element {quoted(element.name)}, "
+    what += f"got {got}"
+    expect(not wrong, path, what)
 
 
 def _fractions(packed: NDArray[np.uint32]) -> NDArray[np.float64]:

@@ -25,7 +25,7 @@ from splatseg.core import Gaussians, Similarity
 from splatseg.core.rigid import rotation_from_quaternion
 from splatseg.core.sh import MAX_DEGREE, SH_C0
 from splatseg.errors import FileFormatError, MissingFileError, quoted
-from splatseg.io.foreign import expect, is_file, read_bytes
+from splatseg.io.foreign import expect, is_file, malformed, read_bytes
 from splatseg.io.json_files import parse_object
 from splatseg.io.schema import structured
 from splatseg.io.splats._rows import SOURCE_ROW, Array, Rows, check_size, finish, read_file, warn
@@ -239,11 +239,9 @@ def _degree(path: Path, attributes: _Attributes) -> int:
         have = [name in attributes for name in names]
         if not any(have):
             continue
-        if level > MAX_DEGREE or not all(have) or degree != level - 1:
-            raise FileFormatError(
-                f"{path}: expected all harmonics of degrees 0 to at most {MAX_DEGREE}, got "
-                f"{sum(have)} of {len(names)} of degree {level} after degree {degree}."
-            )
+        what = f"all harmonics of degrees 0 to at most {MAX_DEGREE}, got {sum(have)} of "
+        what += f"{len(names)} of degree {level} after degree {degree}"
+        expect(level <= MAX_DEGREE and all(have) and degree == level - 1, path, what)
         degree = level
     return degree
 
@@ -270,11 +268,8 @@ def _rows(path: Path, attributes: _Attributes, *, degree: int, logs: bool, space
         for i, name in enumerate(names):
             rows.sh[:, i] = _column(path, attributes, name, 3, count)
     else:
-        expect(
-            "COLOR_0" in attributes,
-            path,
-            "SH_DEGREE_0_COEF_0 or COLOR_0 for Gaussians, got neither",
-        )
+        what = "SH_DEGREE_0_COEF_0 or COLOR_0 for Gaussians, got neither"
+        expect("COLOR_0" in attributes, path, what)
         rows.sh[:, 0] = (_fallback_colour(attributes["COLOR_0"], space) - 0.5) / SH_C0
     return rows
 
@@ -308,15 +303,11 @@ def _similarity(path: Path, transform: NDArray[np.float64]) -> Similarity:
     linear = transform[:3, :3]
     determinant = float(np.linalg.det(linear))
     scale = np.cbrt(abs(determinant))
-    if (
-        determinant <= 0
-        or not np.allclose(transform[3], [0, 0, 0, 1])
-        or not np.allclose(linear.T @ linear, scale**2 * np.eye(3), atol=1e-4 * scale**2)
-    ):
-        raise FileFormatError(
-            f"{path}: expected nodes that move, turn and scale alike in all directions, "
-            f"got the matrix {np.round(transform, 4).tolist()}."
-        )
+    what = "nodes that move, turn and scale alike in all directions, got the matrix "
+    what += f"{np.round(transform, 4).tolist()}"
+    even = np.allclose(linear.T @ linear, scale**2 * np.eye(3), atol=1e-4 * scale**2)
+    sound = determinant > 0 and even and np.allclose(transform[3], [0, 0, 0, 1])
+    expect(sound, path, what)
     left, _, right = np.linalg.svd(linear)
     return Similarity(
         rotation=torch.from_numpy(left @ right),
@@ -394,12 +385,9 @@ class _Gltf:
         stride = view.byteStride or item
         needed = entry.byteOffset + (entry.count - 1) * stride + item if entry.count else 0
         start, length = view.byteOffset, view.byteLength
-        expect(
-            stride >= item and needed <= length and start + length <= len(data),
-            where,
-            f"{needed} bytes, got a view of {length} bytes at byte {start} of {len(data)}, one row "
-            f"each {stride} bytes",
-        )
+        wanted = f"{needed} bytes, got a view of {length} bytes at byte {start} of {len(data)}, "
+        wanted += f"one row each {stride} bytes"
+        expect(stride >= item and needed <= length and start + length <= len(data), where, wanted)
         values: NDArray[Any] = np.empty((0, width), kind)
         if entry.count:
             strides = (stride, kind.itemsize)
@@ -420,9 +408,7 @@ class _Gltf:
             elif self._binary is not None and index == 0:
                 data = self._binary
             else:
-                raise FileFormatError(
-                    f"{where}: expected a uri, or buffer 0 of a .glb file with a binary part."
-                )
+                raise malformed(where, "a uri, or buffer 0 of a .glb file with a binary part")
             have = f"{entry.byteLength} bytes, got {len(data)}: truncated"
             expect(len(data) >= entry.byteLength, where, have)
             self._buffers[index] = data

@@ -277,12 +277,9 @@ def _rest(path: Path, names: Sequence[str]) -> tuple[tuple[str, ...], tuple[str,
     count = sum(re.fullmatch(rf"{prefix}_(0|[1-9]\d*)", name) is not None for name in names)
     rest = tuple(f"{prefix}_{i}" for i in range(count))
     known = [3 * ((degree + 1) ** 2 - 1) for degree in range(MAX_DEGREE + 2)]
-    expect(
-        count in known and set(rest) <= set(names),
-        path,
-        f"{', '.join(map(str, known[:-2]))} or {known[-2]} columns {prefix}_0, {prefix}_1 and so "
-        f"on, got {count}",
-    )
+    what = f"{', '.join(map(str, known[:-2]))} or {known[-2]} columns {prefix}_0, {prefix}_1 and "
+    what += f"so on, got {count}"
+    expect(count in known and set(rest) <= set(names), path, what)
     if count < known[-1]:
         return rest, ()
     kept = tuple(name for i, name in enumerate(rest) if i % (count // 3) < known[-2] // 3)
@@ -481,9 +478,7 @@ def _check_names(extra: Mapping[str, np.ndarray], standard: Sequence[str]) -> No
     normals = [extra[name].dtype for name in _NORMALS if name in extra]
     allowed = _NORMALS if normals == [np.dtype("f4")] * 3 else ()
     for name in extra:
-        if not re.fullmatch(r"[!-~]+", name):
-            raise InputError(
-                f"extra[{name!r}]: expected a name of printable ASCII without spaces, as PLY needs."
-            )
+        what = "a name of printable ASCII without spaces, as PLY needs"
+        expect(re.fullmatch(r"[!-~]+", name), f"extra[{name!r}]", what, error=InputError)
         if (name in standard and name not in allowed) or _REST.fullmatch(name):
             raise InputError(f"extra[{name!r}]: PLY uses the name {name!r} for something else.")

@@ -14,6 +14,7 @@ import json
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -27,7 +28,7 @@ from splatseg.core.gaussians import sigmoid
 from splatseg.core.sh import MAX_DEGREE
 from splatseg.errors import FileFormatError, InputError, MissingFileError, quoted
 from splatseg.io.arrays import open_archive, open_member
-from splatseg.io.foreign import expect, is_file, read_bytes, reading
+from splatseg.io.foreign import expect, is_file, malformed, read_bytes, reading
 from splatseg.io.json_files import parse_object
 from splatseg.io.schema import structured
 from splatseg.io.splats._quantisation import assemble, scalar_codebook, split, vector_palette
@@ -125,20 +126,14 @@ def read_sog(path: Path, *, strict: bool = False) -> Gaussians:
     if not bundled:
         beside = [file for file in path.parent.glob("*.webp") if file.is_file()]
         packed = sum(file.stat().st_size for file in (path, *beside))
-
-        def load_file(name: str, limit: int) -> bytes:
-            return _load_beside(path, name, limit)
-
-        return _Bundle(path, load_file, path.name, packed).gaussians(strict=strict)
+        load = partial(_load_beside, path)
+        return _Bundle(path, load, path.name, packed).gaussians(strict=strict)
     with open_archive(path, where=path, expected="a zip file of SOG") as archive:
         metas = [n for n in archive.namelist() if n.rsplit("/", 1)[-1] == "meta.json"]
         expect(len(metas) == 1, path, f"a zip file with one meta.json, got {len(metas)}")
         folder = metas[0].removesuffix("meta.json")
-
-        def load_member(name: str, limit: int) -> bytes:
-            return _load_member(path, archive, folder + name, limit)
-
-        bundle = _Bundle(path, load_member, "meta.json", path.stat().st_size)
+        load = partial(_load_member, path, archive, folder)
+        bundle = _Bundle(path, load, "meta.json", path.stat().st_size)
         return bundle.gaussians(strict=strict)
 
 
@@ -155,8 +150,9 @@ def _load_beside(path: Path, name: str, limit: int) -> bytes:
     return read_bytes(member, "a picture of SOG")
 
 
-def _load_member(path: Path, archive: zipfile.ZipFile, name: str, limit: int) -> bytes:
+def _load_member(path: Path, archive: zipfile.ZipFile, folder: str, name: str, limit: int) -> bytes:
     """A member of a zip file, unpacked only if it is as small as it should be."""
+    name = folder + name
     with open_member(archive, name, where=path, expected="a zip file of SOG") as (member, _):
         data = member.read(limit + 1)
     expect(len(data) <= limit, path, f"at most {limit} bytes in {quoted(name)}, got more")
@@ -203,12 +199,9 @@ class _Bundle:
         count = self._count
         with self._opened(name, 8 * count + (1 << 20)) as image:
             pixels = image.width * image.height
-            expect(
-                count <= pixels <= 2 * count + (1 << 22),
-                self._path,
-                f"at least {count} pixels in {quoted(name)}, and not many more, got "
-                f"{image.width} x {image.height}",
-            )
+            what = f"at least {count} pixels in {quoted(name)}, and not many more, got "
+            what += f"{image.width} x {image.height}"
+            expect(count <= pixels <= 2 * count + (1 << 22), self._path, what)
             return self._decoded(name, image).reshape(-1, 4)[:count]
 
     def _opened(self, name: str, limit: int) -> Image.Image:
@@ -218,9 +211,7 @@ class _Bundle:
             with reading(self._path, f"a WebP picture in {quoted(name)}"):
                 return Image.open(io.BytesIO(data), formats=["WEBP"])
         except Image.DecompressionBombError as error:
-            raise FileFormatError(
-                f"{self._path}: expected a smaller WebP picture in {quoted(name)}."
-            ) from error
+            raise malformed(self._path, f"a smaller WebP picture in {quoted(name)}") from error
 
     def _decoded(self, name: str, image: Image.Image) -> Pixels:
         """All pixels (height, width, 4); alpha is 255 where the picture has none."""
@@ -280,12 +271,9 @@ class _Bundle:
         with self._opened(name, 1 << 24) as image:
             coefficients = image.width // _PALETTE_WIDTH
             fits = not image.width % _PALETTE_WIDTH and coefficients in (3, 8, 15)
-            expect(
-                fits and image.height <= 1024,
-                path,
-                "a palette of 192, 512 or 960 pixels a row and at most 1024 rows in "
-                f"{quoted(name)}, got {image.width} x {image.height}",
-            )
+            what = "a palette of 192, 512 or 960 pixels a row and at most 1024 rows in "
+            what += f"{quoted(name)}, got {image.width} x {image.height}"
+            expect(fits and image.height <= 1024, path, what)
             pixels = self._decoded(name, image)[..., :3].reshape(-1, coefficients, 3)
         if self._meta.version == 1:
             if entry.mins is None or entry.maxs is None:
@@ -294,9 +282,8 @@ class _Bundle:
             return (entry.mins + (entry.maxs - entry.mins) * share).astype(np.float32)
         bands, count = entry.bands or 0, entry.count or 0
         fits = (bands + 1) ** 2 - 1 == coefficients
-        expect(
-            fits, f"{path}: shN.bands", f"the degree of {coefficients} coefficients, got {bands}"
-        )
+        what = f"the degree of {coefficients} coefficients, got {bands}"
+        expect(fits, f"{path}: shN.bands", what)
         most = f"at most the {len(pixels)} entries of the palette, got {count}"
         expect(count <= len(pixels), f"{path}: shN.count", most)
         codebook = np.full(256, np.nan, np.float32)

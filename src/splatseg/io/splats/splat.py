@@ -48,12 +48,9 @@ def read_splat(path: Path, *, strict: bool = False) -> Gaussians:
     """
     size = check_file(path)
     count, left = divmod(size, _SPLAT.itemsize)
-    expect(
-        not left,
-        path,
-        f"a multiple of {_SPLAT.itemsize} bytes, one row a Gaussian, got {size} bytes: the file is "
-        "truncated or no .splat file",
-    )
+    what = f"a multiple of {_SPLAT.itemsize} bytes, one row a Gaussian, got {size} bytes: the file "
+    what += "is truncated or no .splat file"
+    expect(not left, path, what)
     rows = Rows.empty(count, 1)
     with path.open("rb") as file:
         for part in blocks(count):
@@ -165,16 +162,10 @@ def read_ksplat(path: Path, *, strict: bool = False) -> Gaussians:
             headers say, its buckets do not hold its rows, or a row cannot be rendered.
     """
     data = read_file(path)
-    expect(
-        len(data) >= _HEADER_BYTES,
-        path,
-        f"a .ksplat header of {_HEADER_BYTES} bytes, got {len(data)}",
-    )
-    expect(
-        tuple(data[:2]) == _VERSION,
-        path,
-        f".ksplat version 0.1, got {data[0]}.{data[1]}: another version, or no .ksplat file",
-    )
+    what = f"a .ksplat header of {_HEADER_BYTES} bytes, got {len(data)}"
+    expect(len(data) >= _HEADER_BYTES, path, what)
+    what = f".ksplat version 0.1, got {data[0]}.{data[1]}: another version, or no .ksplat file"
+    expect(tuple(data[:2]) == _VERSION, path, what)
     (level,) = struct.unpack_from("<H", data, 20)
     expect(level <= 2, path, f"compression level 0, 1 or 2, got {level}")
     low, high = struct.unpack_from("<2f", data, 36)
@@ -207,11 +198,8 @@ def _sections(path: Path, data: bytes, level: int) -> tuple[int, list[_Section]]
     """Where sections begin, and their headers, which describe the file to the byte."""
     most, used, _, count = _COUNTS.unpack_from(data, 4)
     first = at = _HEADER_BYTES + _SECTION_BYTES * most
-    expect(
-        used <= most and at <= len(data),
-        path,
-        f"a file of {used} of {most} sections as its header says, got {len(data)} bytes",
-    )
+    what = f"a file of {used} of {most} sections as its header says, got {len(data)} bytes"
+    expect(used <= most and at <= len(data), path, what)
     found: list[_Section] = []
     for index in range(most):
         fields = _SECTION.unpack_from(data, _HEADER_BYTES + _SECTION_BYTES * index)
@@ -225,17 +213,11 @@ def _sections(path: Path, data: bytes, level: int) -> tuple[int, list[_Section]]
         at += section.table_bytes + section.row(level).itemsize * section.room
         found.append(section)
     fault = "truncated" if at > len(data) else "too long"
-    expect(
-        at == len(data),
-        path,
-        f"{at} bytes as its headers say, got {len(data)}: the file is {fault}",
-    )
+    what = f"{at} bytes as its headers say, got {len(data)}: the file is {fault}"
+    expect(at == len(data), path, what)
     total = sum(section.count for section in found)
-    expect(
-        total == count,
-        path,
-        f"{count} Gaussians as its header says, got {total} in its sections",
-    )
+    what = f"{count} Gaussians as its header says, got {total} in its sections"
+    expect(total == count, path, what)
     return first, found
 
 
@@ -248,11 +230,8 @@ def _check_section(where: str, section: _Section, level: int) -> None:
         return
     centres = not section.buckets or section.bucket_bytes == _CENTRE_BYTES
     expect(centres, where, f"buckets of {_CENTRE_BYTES} bytes, got {section.bucket_bytes}")
-    expect(
-        section.full + section.partial == section.buckets,
-        where,
-        f"{section.buckets} buckets, got {section.full} full ones and {section.partial} others",
-    )
+    what = f"{section.buckets} buckets, got {section.full} full ones and {section.partial} others"
+    expect(section.full + section.partial == section.buckets, where, what)
 
 
 def _harmonics(packed: NDArray[np.generic], bounds: tuple[float, float]) -> Array:
@@ -277,9 +256,8 @@ def _bucket_centres(path: Path, data: bytes, at: int, section: _Section) -> NDAr
     centres = np.frombuffer(data, "<f4", 3 * section.buckets, at + 4 * section.partial)
     full = min(section.full * section.bucket_size, section.count)
     held = section.full * section.bucket_size + int(lengths.sum())
-    expect(
-        held >= section.count, path, f"buckets of {section.count} Gaussians, got buckets of {held}"
-    )
+    what = f"buckets of {section.count} Gaussians, got buckets of {held}"
+    expect(held >= section.count, path, what)
     buckets = np.empty(section.count, np.int64)
     if full:
         buckets[:full] = np.arange(full) // section.bucket_size

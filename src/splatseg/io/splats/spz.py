@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from splatseg.core import Gaussians
 from splatseg.core.sh import MAX_DEGREE
 from splatseg.errors import FileFormatError, RangeError, reason
-from splatseg.io.foreign import expect
+from splatseg.io.foreign import expect, malformed
 from splatseg.io.splats._quantisation import pack_signed_three, unpack_signed_three
 from splatseg.io.splats._rows import (
     Array,
@@ -114,11 +114,8 @@ def read_spz(path: Path, *, strict: bool = False) -> Gaussians:
 
 def _header(path: Path, data: bytes) -> _Header:
     """Parse and check the first 16 bytes."""
-    expect(
-        len(data) >= _HEADER.size,
-        path,
-        f"an SPZ header of {_HEADER.size} bytes, got {len(data)}",
-    )
+    what = f"an SPZ header of {_HEADER.size} bytes, got {len(data)}"
+    expect(len(data) >= _HEADER.size, path, what)
     magic, *fields = _HEADER.unpack_from(data)
     header = _Header(*fields)
     expect(magic == MAGIC, path, f"the SPZ magic {MAGIC!r}, got {magic!r}")
@@ -143,9 +140,7 @@ def _unpack_gzip(path: Path, data: bytes) -> tuple[_Header, list[memoryview]]:
         # Extensions may follow the attributes; anything else after them is a wrong count.
         more = stream.decompress(stream.unconsumed_tail, 1) if not stream.eof else b""
     except zlib.error as error:
-        raise FileFormatError(
-            f"{path}: expected gzip data of an SPZ file: {reason(error)}."
-        ) from error
+        raise malformed(path, f"gzip data of an SPZ file: {reason(error)}") from error
     wanted = f"{body} bytes for {header.count} Gaussians of degree {header.degree}"
     enough = len(content) == body
     expect(enough, path, f"{wanted}, got {len(content)}: the file is truncated")
@@ -171,20 +166,14 @@ def _unpack_zstd(path: Path, data: bytes) -> tuple[_Header, list[memoryview]]:
     expect(len(data) >= start, path, f"a header of {start} bytes, got {len(data)}: truncated")
     (table,) = _HEADER_4.unpack_from(data, _HEADER.size)
     at = table + _STREAM.size * header.streams
-    expect(
-        start <= table and at <= len(data),
-        path,
-        f"a table of streams within the file of {len(data)} bytes, got one at byte {table}",
-    )
+    what = f"a table of streams within the file of {len(data)} bytes, got one at byte {table}"
+    expect(start <= table and at <= len(data), path, what)
     check_size(path, header.count, header.degree, packed=len(data))
     entries = [_STREAM.unpack_from(data, table + i * _STREAM.size) for i in range(header.streams)]
     end = at + sum(compressed for compressed, _ in entries)
     fault = "truncated" if end > len(data) else "too long"
-    expect(
-        end == len(data),
-        path,
-        f"{end} bytes as its table of streams says, got {len(data)}: the file is {fault}",
-    )
+    what = f"{end} bytes as its table of streams says, got {len(data)}: the file is {fault}"
+    expect(end == len(data), path, what)
     parts: list[memoryview] = []
     for i, ((compressed, unpacked), size) in enumerate(zip(entries, header.sizes, strict=True)):
         wanted = f"{size * header.count} bytes in stream {i} for {header.count} Gaussians"

@@ -1,7 +1,5 @@
-"""Drives as Waymo and nuScenes publish them: components in Parquet, tables in JSON, points."""
+"""Drives as Waymo publishes them: components in Parquet, and frames of version 1."""
 
-import json
-import struct
 from pathlib import Path
 
 from splatseg.errors import FileFormatError, InputError
@@ -12,8 +10,6 @@ from splatseg_bench.layouts.waymo import read_waymo_scenes
 from support.fuzz.targets.base import Target, target
 from support.waymo_files import CONTEXT, SCHEMAS, tiny_rows, write_segment
 from support.waymo_tfrecord import framed, frames_of, write_tfrecord
-
-_TOKENS = "sensor", "calibrated_sensor", "ego_pose", "sample_data", "sample", "scene", "lidarseg"
 
 
 def _of_waymo(component: str) -> None:
@@ -67,48 +63,3 @@ def frame(folder: Path) -> Target:
             raise FileFormatError(f"{file}: {error}") from error
 
     return Target(file=file, read=read)
-
-
-def _nuscenes(folder: Path) -> None:
-    rows = {
-        "sensor": {"channel": "LIDAR_TOP", "modality": "lidar"},
-        "calibrated_sensor": {"sensor_token": "sensor", "camera_intrinsic": []},
-        "ego_pose": {"timestamp": 7},
-        "sample_data": {
-            "sample_token": "sample", "ego_pose_token": "ego_pose", "is_key_frame": True,
-            "calibrated_sensor_token": "calibrated_sensor", "timestamp": 7,
-            "filename": "samples/LIDAR_TOP/a.pcd.bin",
-        },
-        "sample": {"scene_token": "scene", "timestamp": 7},
-        "scene": {"name": "scene-0061"},
-        "lidarseg": {"sample_data_token": "sample_data", "filename": "lidarseg/v1.0-mini/a.bin"},
-        "category": {"name": "car", "index": 1},
-    }  # fmt: skip
-    for name in ("calibrated_sensor", "ego_pose"):
-        rows[name] |= {"translation": [1, 2, 0.5], "rotation": [1, 0, 0, 0]}
-    for kind in ("v1.0-mini", "samples/LIDAR_TOP", "lidarseg/v1.0-mini"):
-        (folder / kind).mkdir(parents=True)
-    for name, row in rows.items():
-        (folder / "v1.0-mini" / f"{name}.json").write_text(json.dumps([{"token": name, **row}]))
-    points = struct.pack("<10f", 1, 2, 3, 4, 0, 5, 6, 7, 8, 1)
-    (folder / "samples/LIDAR_TOP/a.pcd.bin").write_bytes(points)
-    (folder / "lidarseg/v1.0-mini/a.bin").write_bytes(bytes([1, 0]))
-
-
-def _of_nuscenes(name: str, file: str) -> None:
-    @target(f"nuscenes-{name}")
-    def make(folder: Path) -> Target:
-        _nuscenes(folder)
-
-        def read() -> None:
-            scans = read_scans(folder, format="nuscenes")
-            for scan in scans.scan_names:
-                scans.scan(scan)
-
-        return Target(file=folder / file, read=read)
-
-
-for _name in (*_TOKENS, "category"):
-    _of_nuscenes(f"{_name}.json", f"v1.0-mini/{_name}.json")
-_of_nuscenes("points.bin", "samples/LIDAR_TOP/a.pcd.bin")
-_of_nuscenes("labels.bin", "lidarseg/v1.0-mini/a.bin")
