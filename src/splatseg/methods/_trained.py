@@ -26,7 +26,6 @@ from splatseg.core import (
 )
 from splatseg.core.checkpoints import Checkpoints
 from splatseg.core.options import Share, options
-from splatseg.errors import RangeError
 from splatseg.lift.label_maps import ClassifierHead
 from splatseg.lift.training import (
     LabelTargets,
@@ -38,7 +37,6 @@ from splatseg.lift.training import (
 )
 from splatseg.lift.voting.uplift import names_of, voting_views
 from splatseg.methods._method import MethodInputs
-from splatseg.render import RenderOptions
 
 
 @options
@@ -51,16 +49,6 @@ class LabelTrainingOptions(RowTrainingOptions):
 
     min_share: Share = 0.0
     """Minimum probability, in [0, 1], of a Gaussian's id; below it there is no label."""
-
-
-def check_rate(name: str, value: float) -> None:
-    """Refuse a rate or weight below 0.
-
-    Raises:
-        RangeError: If it is below 0 or not finite.
-    """
-    if not (math.isfinite(value) and value >= 0):
-        raise RangeError(f"{name}: expected 0 or more, got {value}.")
 
 
 TINY = 1e-10
@@ -158,9 +146,6 @@ _NOT_TRAINED = ("readout", "min_share", "memory")
 class TrainingContext:
     """What a training on label maps gets besides its data and options."""
 
-    render_options: RenderOptions | None = None
-    """Switches of the blending model."""
-
     backend: str = "auto"
     """Name of the rendering backend."""
 
@@ -206,7 +191,6 @@ def label_data(
         ordered,
         source,
         options=options.drawing(),
-        render_options=context.render_options,
         backend=context.backend,
     )
     return LabelData(sampler=sampler, ids=source.ids, views=ordered)

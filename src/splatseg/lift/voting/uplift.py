@@ -219,7 +219,6 @@ def uplift(
     *,
     options: UpliftOptions | None = None,
     classes: ClassTable | None = None,
-    render_options: RenderOptions | None = None,
     backend: str = "auto",
     progress: Callable[[int, int], None] | None = None,
 ) -> Labels:
@@ -237,7 +236,6 @@ def uplift(
         evidence: Their label maps, as large as the photographs or reduced in proportion.
         options: How votes become labels.
         classes: Names of the ids, for the info.
-        render_options: Switches of the blending model.
         backend: Name of the rendering backend.
         progress: Called with the views done and all there are to do.
 
@@ -258,7 +256,6 @@ def uplift(
         ordered,
         evidence,
         options=options,
-        render_options=render_options or options_for(gaussians, backend),
         backend=backend,
         progress=progress,
     )
@@ -287,14 +284,14 @@ def _collected(
     evidence: LabelSource,
     *,
     options: UpliftOptions,
-    render_options: RenderOptions,
     backend: str,
     progress: Callable[[int, int], None] | None,
 ) -> _Votes:
     """Go through the views once and add up their votes."""
     by_view = ViewVotes(gaussians.means) if options.candidates > 1 else None
+    rendering = options_for(gaussians, backend)
     adjoint = RenderAdjoint(
-        gaussians=gaussians, options=render_options, backend=backend, by_view=by_view
+        gaussians=gaussians, options=rendering, backend=backend, by_view=by_view
     )
     slots = max(SLOTS, options.candidates)
     table = VoteTable(len(gaussians), memory=options.memory, slots=slots)

@@ -242,7 +242,6 @@ def distilled_features(
     source: BlockSource,
     *,
     pixels: Int64[Tensor, "n"] | None = None,
-    render_options: RenderOptions | None = None,
     backend: str = "auto",
     progress: Callable[[int, int], None] | None = None,
 ) -> DistilledFeatures:
@@ -253,7 +252,6 @@ def distilled_features(
         views: Those whose features are used.
         source: Their features.
         pixels: What sums are divided by, of `pixel_counts`; None divides by blending weights.
-        render_options: Switches of the blending model.
         backend: Name of the rendering backend.
         progress: Called with the views done and all there are.
 
@@ -268,7 +266,6 @@ def distilled_features(
         ordered,
         reduced,
         options=FeatureUpliftOptions(longest_side=LIFTED_SIDE),
-        render_options=render_options,
         backend=backend,
         progress=progress,
     )
@@ -292,12 +289,11 @@ def pixel_counts(
     gaussians: Gaussians,
     views: Sequence[View],
     *,
-    render_options: RenderOptions | None = None,
     backend: str = "auto",
 ) -> Int64[Tensor, "n"]:
     """In how many pixels of all views each Gaussian takes part: the counter of eq. 2."""
     found = torch.zeros(len(gaussians), dtype=torch.int64)
-    options = render_options or options_for(gaussians, backend)
+    options = options_for(gaussians, backend)
     for view in views:
         found += view_pixel_counts(gaussians, view, options, backend)
     return found

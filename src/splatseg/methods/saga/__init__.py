@@ -7,7 +7,8 @@ pixels are to be as alike as the sets of their masks (correspondence loss, eq. 8
 
 .. math:: \mathcal{L} = \mathcal{L}_{SAM} + \lambda \mathcal{L}_{corr} .
 
-A step has the grid of 64 x 64 cells of one view, and Adam moves all Gaussians (docs/decisions/features.md).
+A step has the grid of 64 x 64 cells of one view, and Adam moves all Gaussians
+(docs/decisions/features.md).
 Where the text and the published code differ, this follows the code: both losses are means, negative
 cosines of the correspondence loss count 0, and a tenth of the mean positive product of queries with
 a random tenth of all Gaussians is added. Where there are no 2D features, the query of a mask is the
@@ -17,7 +18,8 @@ By default features are directions and are compared behind a gate of the scale t
 so that one training serves parts, objects and groups: at a scale, pixels belong together that share
 a mask up to it (`model.together_at`). The masks are associated first (`methods.associate`):
 features start as codes of the nodes that Gaussians are in (`masks`), the scale of a mask is
-the level of its node, and training is kept as far as it makes held-out views better. docs/decisions/features.md.
+the level of its node, and training is kept as far as it makes held-out views better.
+docs/decisions/features.md.
 
 References:
     Cen et al., Segment Any 3D Gaussians (2023), section 3.3, and its published code for rates,

@@ -23,7 +23,8 @@ PUBLISHED_GRID = 64
 """Cells a side of the grid of a view: that of SAM's features."""
 
 SHORT_STEPS = 300
-"""Steps that `SagaOptions.published` takes instead, at 100 times the rate: docs/decisions/features.md."""
+"""Steps that `SagaOptions.published` takes instead, at 100 times the rate:
+docs/decisions/features.md."""
 
 _PUBLISHED_EPSILON = 1e-15
 
@@ -173,7 +174,8 @@ class SagaOptions:
         A step has the 64 x 64 cells of one view. Nothing is held out and all steps are done. Rate
         times steps stays 75, as published (0.0025 times 30 000): Adam moves a feature by about
         the rate each time that it is shown, whatever the gradient. Results are not the same:
-        fewer steps end farther from the start (docs/decisions/features.md). ``steps=30_000`` is the paper's.
+        fewer steps end farther from the start (docs/decisions/features.md). ``steps=30_000`` is
+        the paper's.
 
         Args:
             steps: How many.

@@ -242,7 +242,6 @@ def train_saga(
         ordered,
         source,
         options=options.drawing(),
-        render_options=context.render_options,
         backend=context.backend,
     )
     model = SagaModel(
