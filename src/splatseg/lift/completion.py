@@ -25,9 +25,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from splatseg._check import check_rows
 from splatseg.core import UNLABELLED, Features, Gaussians, Labels
 from splatseg.core.boundary import boundary
-from splatseg.errors import ShapeError
 from splatseg.lift.neighbour_graph import (
     NodeAttributes,
     diffuse,
@@ -128,15 +128,10 @@ def _spread(
 
 
 def _check(gaussians: Gaussians, labels: Labels, features: Features | None) -> None:
-    if len(labels) != len(gaussians):
-        raise ShapeError(
-            f"labels: expected {len(gaussians)} rows, one a Gaussian, got {len(labels)}."
-        )
+    check_rows("labels", labels, len(gaussians))
     gaussians.check_values()
-    if features is not None and len(features) != len(gaussians):
-        raise ShapeError(
-            f"features: expected {len(gaussians)} rows, one a Gaussian, got {len(features)}."
-        )
+    if features is not None:
+        check_rows("features", features, len(gaussians))
 
 
 def _known(labels: Labels) -> NDArray[np.bool_]:

@@ -13,6 +13,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from splatseg.core import (
+    JSON,
     LEARNED_BYTES,
     LOSS_CURVE,
     ClassTable,
@@ -20,7 +21,6 @@ from splatseg.core import (
     Gaussians,
     Labels,
     LabelSource,
-    Layer,
     LayerInfo,
     View,
 )
@@ -264,46 +264,21 @@ def layer_info(
         names=names_of(classes, data.ids.tolist()),
         seed=seed,
         head=head.to_json(),
-        details={
-            "loss": float(np.mean(result.losses[-20:])),
-            "steps": len(result.losses),
-            "best_step": result.best_step,
-            "stopped": result.stopped,
-            "scores": [[step, score] for step, score in result.scores],
-            LOSS_CURVE: loss_curve(result.losses),
-            LEARNED_BYTES: result.learned_bytes,
-        },
+        details=training_details(result),
     )
 
 
-def features_layer(
-    values: Float[Tensor, "n channels"], result: TrainingResult, info: LayerInfo
-) -> Features:
-    """Trained values as a layer; Gaussians that no drawn pixel shows have a weight of 0."""
-    return Features(values=values, weights=result.visibility, info=info)
-
-
-def runner(train_features: Callable[..., Features]) -> Callable[[MethodInputs, Any], Layer]:
-    """The `Method.run` of a method that trains features with a head.
-
-    Args:
-        train_features: Takes Gaussians, views and evidence, and by keyword the options, the
-            names of classes and a `TrainingContext`.
-    """
-
-    def run(inputs: MethodInputs, options: LabelTrainingOptions) -> Layer:
-        """Train, and read the features as the options say."""
-        features = train_features(
-            inputs.gaussians,
-            inputs.views,
-            inputs.evidence,
-            options=options,
-            classes=inputs.label_names,
-            context=context_of(inputs),
-        )
-        return features if options.readout == "rendered" else hard_labels(features, options)
-
-    return run
+def training_details(result: TrainingResult) -> dict[str, JSON]:
+    """How a training went, for the info of a layer."""
+    return {
+        "loss": float(np.mean(result.losses[-20:])),
+        "steps": len(result.losses),
+        "best_step": result.best_step,
+        "stopped": result.stopped,
+        "scores": [[step, score] for step, score in result.scores],
+        LOSS_CURVE: loss_curve(result.losses),
+        LEARNED_BYTES: result.learned_bytes,
+    }
 
 
 def context_of(inputs: MethodInputs) -> TrainingContext:

@@ -343,7 +343,8 @@ class RowSampler:
         gaussians.check_values()
         self._gaussians = gaussians
         self._source = source
-        self._options = options or SamplingOptions()
+        self.options: SamplingOptions = options or SamplingOptions()
+        """Which pixels are drawn."""
         self._render_options = options_for(gaussians, backend)
         self._backend = backend
 
@@ -363,14 +364,9 @@ class RowSampler:
             self._gaussians,
             views,
             self._source,
-            options=self._options,
+            options=self.options,
             backend=self._backend,
         )
-
-    @property
-    def options(self) -> SamplingOptions:
-        """Which pixels are drawn."""
-        return self._options
 
     @property
     def backend(self) -> str:
@@ -410,11 +406,11 @@ class RowSampler:
             InputError: If no view has anything to learn.
             SplatsegError: If rows beyond the memory budget cannot be written.
         """
-        budget = TensorBudget(self._options.memory)
+        budget = TensorBudget(self.options.memory)
         found: list[DrawnView] = []
         try:
             for view in self._views:
-                drawn = self._drawn(view, rng, pixels or self._options.pixels)
+                drawn = self._drawn(view, rng, pixels or self.options.pixels)
                 found.append(drawn.with_tensors(budget.kept(drawn.tensors())))
         except BaseException:
             found.clear()
@@ -423,11 +419,11 @@ class RowSampler:
         sizes = [len(drawn) for drawn in found]
         if not sum(sizes):
             raise InputError(f"views: expected something to learn in {len(found)}, found none.")
-        groups = batch_groups(sizes, batch, self._options.views_per_batch, rng)
+        groups = batch_groups(sizes, batch, self.options.views_per_batch, rng)
         return DrawnRows(found, budget, groups)
 
     def _drawn(self, view: View, rng: np.random.Generator, count: int) -> DrawnView:
-        source, options = self._source, self._options
+        source, options = self._source, self.options
         choice = source.choice(view.name)
         if choice.grid:
             camera = view.camera.resized(choice.width, choice.height)

@@ -146,10 +146,11 @@ class LabelTargets:
     @boundary
     def __init__(self, evidence: LabelSource, names: Sequence[str]) -> None:
         self._evidence = evidence
-        self._names = tuple(sorted(names))
+        self.view_names: Sequence[str] = tuple(sorted(names))
+        """The views to learn from."""
         digest = hashlib.sha256()
         found: set[int] = set()
-        for name in self._names:
+        for name in self.view_names:
             label_map = evidence.label_map(name)
             digest.update(repr((name, label_map.height, label_map.width)).encode())
             digest.update(label_map.ids.cpu().numpy().tobytes())
@@ -159,26 +160,13 @@ class LabelTargets:
         found.discard(UNLABELLED)
         if not found:
             raise InputError(
-                f"evidence: expected a labelled pixel in {len(self._names)} views, found none."
+                f"evidence: expected a labelled pixel in {len(self.view_names)} views, found none."
             )
-        self._ids = torch.tensor(sorted(found))
-        self._last: tuple[str, LabelMap] | None = None
-        self._fingerprint = digest.hexdigest()
-
-    @property
-    def ids(self) -> Int64[Tensor, "classes"]:
+        self.ids = torch.tensor(sorted(found))
         """All ids, ascending."""
-        return self._ids
-
-    @property
-    def view_names(self) -> Sequence[str]:
-        """The views to learn from."""
-        return self._names
-
-    @property
-    def fingerprint(self) -> str:
+        self._last: tuple[str, LabelMap] | None = None
+        self.fingerprint: str = digest.hexdigest()
         """A digest of all maps."""
-        return self._fingerprint
 
     def choice(self, name: str) -> PixelChoice:
         """Labelled pixels."""
@@ -201,7 +189,7 @@ class LabelTargets:
         confidence = torch.ones(len(pixels))
         if label_map.confidence is not None:
             confidence = label_map.confidence.cpu().float().reshape(-1)[pixels]
-        return {"label": torch.searchsorted(self._ids, flat[pixels]), "confidence": confidence}
+        return {"label": torch.searchsorted(self.ids, flat[pixels]), "confidence": confidence}
 
     def _label_map(self, name: str) -> LabelMap:
         """The map of a view; that of the last one asked for is still there."""
@@ -227,27 +215,21 @@ class MaskTargets:
     @boundary
     def __init__(self, evidence: MaskSets, names: Sequence[str]) -> None:
         self._evidence = evidence
-        self._names = tuple(sorted(names))
+        self.view_names: Sequence[str] = tuple(sorted(names))
+        """The views to learn from."""
         digest, some = hashlib.sha256(), False
-        for name in self._names:
+        for name in self.view_names:
             masks = evidence.masks(name)
             digest.update(repr((name, masks.height, masks.width)).encode())
             for mask in masks.masks:
                 digest.update(np.asarray(mask.counts, dtype=np.int64).tobytes())
                 some = some or mask.area > 0
         if not some:
-            raise InputError(f"evidence: expected a mask in {len(self._names)} views, found none.")
-        self._fingerprint = digest.hexdigest()
-
-    @property
-    def view_names(self) -> Sequence[str]:
-        """The views to learn from."""
-        return self._names
-
-    @property
-    def fingerprint(self) -> str:
+            raise InputError(
+                f"evidence: expected a mask in {len(self.view_names)} views, found none."
+            )
+        self.fingerprint: str = digest.hexdigest()
         """A digest of all masks."""
-        return self._fingerprint
 
     def choice(self, name: str) -> PixelChoice:
         """All pixels."""

@@ -80,7 +80,8 @@ class ReducedBlocks:
     ) -> None:
         self._source = source
         first = source.deep_features(views[0])
-        self._names = tuple(first.depths)
+        self.names: tuple[str, ...] = tuple(first.depths)
+        """Names of the blocks, the shallowest first."""
         self._token = first.class_token is not None
         self._channels = tuple(grid.channels for grid in first.maps)
         self._components = components
@@ -90,11 +91,6 @@ class ReducedBlocks:
     def view_names(self) -> Sequence[str]:
         """Views that have features."""
         return self._source.view_names
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the blocks, the shallowest first."""
-        return self._names
 
     @property
     def columns(self) -> tuple[slice, ...]:
@@ -138,9 +134,9 @@ class ReducedBlocks:
 
     def _checked(self, name: str) -> DeepFeatures:
         found = self._source.deep_features(name)
-        if tuple(found.depths) != self._names:
+        if tuple(found.depths) != self.names:
             raise InputError(
-                f"evidence: expected the blocks {', '.join(self._names)} of view {name}, got "
+                f"evidence: expected the blocks {', '.join(self.names)} of view {name}, got "
                 f"{', '.join(found.depths)}."
             )
         if (found.class_token is not None) != self._token:

@@ -23,7 +23,6 @@ from splatseg.methods.cosseg.options import Spatial
 from splatseg.methods.cosseg.pyramid import (
     MAX_METRES,
     PointPyramid,
-    PyramidOptions,
     feed_points,
     point_pyramid,
     points_origin,
@@ -110,9 +109,7 @@ def spatial_features(
     metres = _in_metres(positions.detach().cpu().double(), frame.metres_per_unit)
     given = colours if encoder.colour else None
     local, channels = feed_points(metres, given, inputs=encoder.inputs, origin=frame.origin)
-    config = encoder.config
-    shape = PyramidOptions(neighbours=config.neighbours, ratios=config.ratios)
-    pyramid = point_pyramid(local, options=shape, seed=seed)
+    pyramid = point_pyramid(local, options=encoder.config, seed=seed)
     with torch.no_grad():
         levels = encoder.encoder(pyramid, channels)
     return pyramid, tuple(_halved(level) for level in levels)
