@@ -15,7 +15,6 @@ Every row is a process of its own, so that its seconds and its peak of memory ar
 - `associate`: of tracks.
 - `joint`: `cosseg` with Gaussians that learn along (`--joint`); with the mean PSNR of test views,
   before and after.
-- `walk`: votes smoothed by a random walk over neighbours alike in colour and features.
 
 Label maps of classes are scored by ``score.py semantic``; of tracks by ``instances`` and
 ``panoptic``, with the class of each instance.
@@ -39,15 +38,10 @@ from scored import _SCORE, ScoredScene
 
 from splatseg.core import Features, InstanceTree, Labels, Layer, Scene
 from splatseg.evaluate import psnr, render_and_photograph
-from splatseg.io.evidence import open_evidence
 from splatseg.io.scene import load_scene
 from splatseg.lift import (
-    CompletionOptions,
     GaussianField,
-    UpliftOptions,
-    complete,
     label_map,
-    uplift,
 )
 from splatseg.lift.label_maps import ClassifierHead
 from splatseg.methods import find_method
@@ -76,8 +70,6 @@ def made(
     """The layer of a row, and the scene that it belongs to."""
     if row == "object_vote":
         return object_vote(scene, evidence), scene
-    if row == "walk":
-        return random_walk(scene, evidence), scene
     name, own, shared = METHODS[row]
     method = find_method(name)
     base = method.published_options if shared.get("published") else method.options()
@@ -111,20 +103,6 @@ def object_vote(scene: Any, evidence: str) -> Labels:
         if len(own):
             out[inside] = int(torch.bincount(own).argmax())
     return Labels(ids=out.int(), confidence=torch.ones(len(out)), info=votes.info)
-
-
-def random_walk(scene: Any, evidence: str) -> Layer:
-    """Votes smoothed over neighbours that look alike, by the deepest block of features_dino."""
-    if scene.source is None:
-        raise ValueError
-    found = open_evidence(scene.source / evidence)
-    votes = uplift(scene.gaussians, scene.train_views, found, options=UpliftOptions(candidates=8))
-    features = segment(scene, "features", options=SegmentOptions(evidence="features_dino")).layer
-    if not isinstance(features, Features):
-        raise TypeError
-    options = CompletionOptions(smoothing=200, smoothing_steps=20)
-    walked = complete(scene.gaussians, votes, features=features, options=options)
-    return replace(walked, candidates=None, shares=None)
 
 
 def drawn(bench: ScoredScene, layer: Layer, row: str) -> Path:
@@ -235,9 +213,7 @@ def main() -> None:
     parser.add_argument("scene", type=Path)
     parser.add_argument("data", type=Path)
     parser.add_argument("--evidence", default="labels_semantic_hard")
-    parser.add_argument(
-        "--rows", nargs="+", choices=[*METHODS, "object_vote", "walk"], required=True
-    )
+    parser.add_argument("--rows", nargs="+", choices=[*METHODS, "object_vote"], required=True)
     parser.add_argument("--set", nargs="*", default=[], metavar="OPTION=VALUE")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--work", type=Path, help="keep label maps here")

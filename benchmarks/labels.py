@@ -6,7 +6,7 @@ Rows, each a method on a folder of evidence (`splatseg segment` does the same):
 
 - `truth`: true class maps and true instance maps through `uplift`.
 - `semantic`: `labels_semantic` as they came (on the train views), voted for by centres, through
-  `uplift`, completed, smoothed, and relabelled under how the evidence errs.
+  `uplift`, completed, and relabelled under how the evidence errs.
 - `tracked`: `labels_tracked` through `uplift`, repaired by `associate`, and through `identity`.
 - `panoptic`: `labels_panoptic` with every segment given its true instance (the ceiling of
   association), and through `associate`.
@@ -29,7 +29,6 @@ from scored import ScoredScene, run_rows
 from splatseg.core import Gaussians, InstanceTree, LabelMap, Labels, View
 from splatseg.io.evidence import Evidence, open_evidence
 from splatseg.lift import (
-    CompletionOptions,
     ConfusionOptions,
     EvidenceSegments,
     UpliftOptions,
@@ -117,20 +116,9 @@ def semantic(bench: Bench) -> None:
     hard = replace(soft, candidates=None, shares=None)
     bench.row("labels_semantic, uplift", "semantic", lambda: hard)
     bench.row("labels_semantic, completed", "semantic", lambda: complete(gaussians, hard))
-    smooth = CompletionOptions(smoothing=50)
-    bench.row(
-        "labels_semantic, smoothed",
-        "semantic",
-        lambda: hardened(complete(gaussians, soft, options=smooth)),
-    )
     again = correct_confusion(soft, view_correlation=soft.info.view_correlation)
     hard = replace(again, candidates=None, shares=None)
     bench.row("labels_semantic, relabelled", "semantic", lambda: complete(gaussians, hard))
-    bench.row(
-        "labels_semantic, relabelled and smoothed",
-        "semantic",
-        lambda: hardened(complete(gaussians, again, options=smooth)),
-    )
 
 
 def tracked(bench: Bench) -> None:
@@ -161,11 +149,6 @@ def panoptic(bench: Bench) -> None:
 def sam(bench: Bench) -> None:
     """Overlapping masks of objects, parts and groups."""
     _associated(bench, "masks_sam", bench.evidence("masks_sam"))
-
-
-def hardened(labels: Labels) -> Labels:
-    """The winners alone."""
-    return replace(labels, candidates=None, shares=None)
 
 
 def _completed(gaussians: Gaussians, layer: Labels | InstanceTree) -> Labels:

@@ -60,7 +60,6 @@ from splatseg.io.captures import read_capture
 from splatseg.io.scans import read_scans
 from splatseg.io.scene import load_scene
 from splatseg.lift import GaussianField, PointLabelOptions
-from splatseg.lift.point_regions import region_labels
 from splatseg.lift.viewed_points import ViewedPointOptions, ViewedPoints, points_in_sight
 from splatseg.methods import find_method
 from splatseg.neighbours import NeighbourIndex
@@ -68,6 +67,7 @@ from splatseg.street.field import MeshField
 from splatseg.street.files import load_mesh_field
 from splatseg.tasks.scan_labels import viewed_points
 from splatseg.tasks.segment import SegmentOptions, segment
+from splatseg_bench.region_voting import region_labels
 
 LAYER = "street"
 BIG = 1000

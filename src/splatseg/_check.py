@@ -1,7 +1,7 @@
 """Checks at the public boundary: one sentence each, naming the argument."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Sequence, Sized
 
 import torch
 from torch import Tensor
@@ -18,6 +18,12 @@ def check_shape(name: str, tensor: Tensor, shape: Sequence[int | None]) -> None:
         return
     expected = ", ".join("any" if want is None else str(want) for want in shape)
     raise ShapeError(f"{name}: expected shape ({expected}), got {actual}.")
+
+
+def check_rows(name: str, rows: Sized, count: int) -> None:
+    """Raise `ShapeError` unless there is one row a Gaussian."""
+    if len(rows) != count:
+        raise ShapeError(f"{name}: expected {count} rows, one a Gaussian, got {len(rows)}.")
 
 
 def check_finite(name: str, tensor: Tensor) -> None:

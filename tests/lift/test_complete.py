@@ -13,9 +13,9 @@ from splatseg.core import (
     Labels,
     LayerInfo,
 )
-from splatseg.errors import InputError, RangeError, ShapeError
+from splatseg.errors import RangeError, ShapeError
 from splatseg.lift import completion
-from splatseg.lift.completion import CompletionOptions, complete
+from splatseg.lift.completion import complete
 from splatseg.lift.neighbour_graph import (
     NodeAttributes,
     diffuse,
@@ -50,12 +50,12 @@ CONSTANTS = {
 
 
 def labelled(gaussians, labels, features=None, **changes) -> Labels:
-    """Completed with other options, or constants of the module."""
+    """Completed with other constants of the module."""
     with pytest.MonkeyPatch.context() as patch:
         for name in CONSTANTS.keys() & changes.keys():
             patch.setattr(completion, CONSTANTS[name], changes.pop(name))
-        options = CompletionOptions(**changes)
-        return complete(gaussians, labels, options=options, features=features)
+        assert not changes
+        return complete(gaussians, labels, features=features)
 
 
 def test_edges_are_as_strong_as_the_formula_says() -> None:
@@ -127,33 +127,19 @@ def test_some_rows_of_the_graph_are_those_of_the_whole(rng, monkeypatch) -> None
 
 
 def test_diffusion_is_the_formula(rng) -> None:
-    """Against dense matrices: some nodes held, some that know nothing, some that listen."""
-    count, ids, neighbour_weight = 30, 4, 0.7
+    """Against dense matrices: some nodes keep what they know, the others listen."""
+    count, ids = 30, 4
     nodes = NodeAttributes(positions=rng.normal(size=(count, 3)))
     transition = transition_matrix(
         neighbour_graph(nodes, neighbours=4, colour_width=1, feature_width=1)
     )
-    own_weight = rng.uniform(0.1, 3.0, count).astype(np.float32)
-    own_weight[::3] = np.inf
-    own_weight[1::3] = 0
-    shares = rng.dirichlet(np.ones(ids), count).astype(np.float32)
+    known = np.arange(count) % 3 == 0
+    shares = rng.dirichlet(np.ones(ids), count).astype(np.float32) * known[:, None]
     expected = shares.astype(np.float64)
     for _ in range(7):
-        of_neighbours = transition.toarray() @ expected
-        with np.errstate(invalid="ignore"):
-            averaged = (own_weight[:, None] * shares + neighbour_weight * of_neighbours) / (
-                own_weight[:, None] + neighbour_weight
-            )
-        expected = np.where(np.isinf(own_weight)[:, None], shares, averaged)
+        expected = np.where(known[:, None], shares, transition.toarray() @ expected)
     sparse = scipy.sparse.csr_matrix(shares)
-    result = diffuse(
-        transition[~np.isinf(own_weight)],
-        sparse,
-        own_weight,
-        neighbour_weight=neighbour_weight,
-        steps=7,
-        max_shares=ids,
-    )
+    result = diffuse(transition[~known], sparse, known, steps=7, max_shares=ids)
     np.testing.assert_allclose(result.toarray(), expected, atol=1e-6)
     columns, values = ranked(result, 2)
     np.testing.assert_array_equal(columns[:, 0], expected.argmax(axis=1))
@@ -164,15 +150,8 @@ def test_only_the_strongest_shares_are_carried() -> None:
     """A node that hears of three ids alike passes on the two with the smaller names."""
     transition = scipy.sparse.csr_matrix(np.array([[0, 1 / 3, 1 / 3, 1 / 3], *np.zeros((3, 4))]))
     shares = scipy.sparse.csr_matrix(np.array([[0, 0, 0], *np.eye(3)], dtype=np.float32))
-    own_weight = np.array([0, np.inf, np.inf, np.inf], dtype=np.float32)
-    result = diffuse(
-        transition.astype(np.float32)[:1],
-        shares,
-        own_weight,
-        neighbour_weight=1.0,
-        steps=1,
-        max_shares=2,
-    )
+    known = np.array([False, True, True, True])
+    result = diffuse(transition.astype(np.float32)[:1], shares, known, steps=1, max_shares=2)
     np.testing.assert_allclose(result.toarray()[0], [1 / 3, 1 / 3, 0], atol=1e-6)
     columns, _ = ranked(result, 3)
     assert columns[0].tolist() == [0, 1, -1]
@@ -191,7 +170,7 @@ def test_the_unknown_between_two_known_takes_the_nearer_label() -> None:
     assert completed.evidence is not None
     assert completed.evidence.tolist() == [5.0, 0.0, 0.0, 5.0]
     facts = completed.info.edit("complete")
-    assert (facts["inferred"], facts["corrected"], facts["unreached"]) == (2, 0, 0)
+    assert (facts["inferred"], facts["unreached"]) == (2, 0)
 
 
 def test_inferred_confidence_is_where_a_random_walk_ends() -> None:
@@ -252,43 +231,6 @@ def test_soft_layers_stay_soft_and_known_rows_stay_as_they_are() -> None:
     assert soft.ids.tolist() == [4, 9, 9]
 
 
-def smoothed_by_hand(labels: Labels, *, strength: float) -> torch.Tensor:
-    """Three in a row with equal edges and ids 1 and 2, iterated in full precision."""
-    transition = torch.tensor([[0.0, 1, 0], [0.5, 0, 0.5], [0, 1, 0]], dtype=torch.float64)
-    own = labels.evidence.double().unsqueeze(1)
-    given = (labels.ids.unsqueeze(1) == torch.tensor([1, 2])).double()
-    given = given * labels.confidence.double().unsqueeze(1)
-    now = given
-    for _ in range(5):
-        now = (own * given + strength * transition @ now) / (own + strength)
-    return now
-
-
-def test_smoothing_corrects_what_little_evidence_says() -> None:
-    gaussians = on_a_line([0.0, 1.0, 2.0])
-    labels = hard([1, 2, 1], confidence=[0.9, 0.6, 0.9], evidence=[40.0, 2.0, 40.0])
-    given = {"neighbours": 1}
-    assert labelled(gaussians, labels, **given).ids.tolist() == [1, 2, 1]
-    weak = labelled(gaussians, labels, smoothing=0.4, **given)
-    assert weak.ids.tolist() == [1, 2, 1]
-    assert not bool(weak.inferred.any())
-    strong = labelled(gaussians, labels, smoothing=8.0, **given)
-    assert strong.ids.tolist() == [1, 1, 1]
-    assert strong.inferred.tolist() == [False, True, False]
-    assert strong.info.edit("complete")["corrected"] == 1
-    for result, strength in ((weak, 0.4), (strong, 8.0)):
-        expected = smoothed_by_hand(labels, strength=strength).amax(dim=1)
-        torch.testing.assert_close(result.confidence.double(), expected, rtol=0, atol=1e-5)
-
-
-def test_smoothing_and_filling_go_together() -> None:
-    gaussians = on_a_line([0.0, 1.0, 2.0, 3.0])
-    labels = hard([1, 2, 1, -1], evidence=[40.0, 1.0, 40.0, 0.0])
-    both = labelled(gaussians, labels, neighbours=2, smoothing=2.0)
-    assert both.ids.tolist() == [1, 1, 1, 1]
-    assert both.inferred.tolist() == [False, True, False, True]
-
-
 def test_completing_twice_is_completing_once(rng) -> None:
     gaussians = gaussians_at(rng.normal(size=(80, 3)))
     ids = rng.integers(-1, 4, 80)
@@ -317,12 +259,11 @@ def test_order_of_the_gaussians_changes_nothing(rng) -> None:
     ids = rng.integers(-1, 5, 120)
     labels = hard(ids.tolist(), evidence=rng.uniform(0.1, 9, 120).astype(np.float32).tolist())
     order = torch.from_numpy(rng.permutation(120))
-    for smoothing in (0.0, 1.0):
-        here = labelled(gaussians, labels, smoothing=smoothing)[order]
-        there = labelled(gaussians[order], labels[order], smoothing=smoothing)
-        assert torch.equal(here.ids, there.ids)
-        assert torch.equal(here.inferred, there.inferred)
-        torch.testing.assert_close(here.confidence, there.confidence, rtol=0, atol=1e-5)
+    here = complete(gaussians, labels)[order]
+    there = complete(gaussians[order], labels[order])
+    assert torch.equal(here.ids, there.ids)
+    assert torch.equal(here.inferred, there.inferred)
+    torch.testing.assert_close(here.confidence, there.confidence, rtol=0, atol=1e-5)
 
 
 def test_nothing_known_nothing_there() -> None:
@@ -341,7 +282,7 @@ def test_what_was_done_is_recorded() -> None:
     labels = hard([1, -1], info=LayerInfo(method="uplift"))
     info = complete(on_a_line([0.0, 1.0]), labels).info
     assert info.method == "uplift"
-    assert info.edit("complete")["options"] == {"smoothing": 0.0, "smoothing_steps": 5}
+    assert info.edit("complete") == {"inferred": 1, "unreached": 0}
 
 
 def test_bad_input_is_refused() -> None:
@@ -352,14 +293,3 @@ def test_bad_input_is_refused() -> None:
         complete(gaussians, labels, features=Features(values=torch.ones(3, 1)))
     with pytest.raises(RangeError, match="means"):
         complete(on_a_line([0.0, math.nan]), labels)
-    with pytest.raises(InputError, match="smoothing: expected a layer with the evidence"):
-        labelled(gaussians, hard([1, -1]), smoothing=1.0)
-    for wrong in (
-        {"smoothing_steps": 0},
-        {"smoothing": -0.1},
-        {"smoothing": math.nan},
-    ):
-        with pytest.raises(RangeError, match=next(iter(wrong))):
-            CompletionOptions(**wrong)
-    with pytest.raises(InputError, match="completed_layer: this option was removed"):
-        CompletionOptions(completed_layer="hard")

@@ -27,7 +27,6 @@ from splatseg.io.arrays import save_arrays
 from splatseg.io.atomic import atomic_file, path_inside
 from splatseg.io.evidence import open_evidence
 from splatseg.lift import GaussianField
-from splatseg.lift.point_regions import region_labels
 from splatseg.methods import Method
 from splatseg.street.build import METHOD_NAME
 from splatseg.street.field import MeshField
@@ -39,6 +38,7 @@ from splatseg_bench.job import Job
 from splatseg_bench.maps import Scores, TrueMapSource, class_scores, keep_map
 from splatseg_bench.points import read_by_words, read_in_words
 from splatseg_bench.protocols import SKY, TABLE_1, Protocol, StreetSwitches, merged_name
+from splatseg_bench.region_voting import region_labels
 from splatseg_bench.scene import BenchmarkScene, TruePoints
 from splatseg_bench.scenes import held_out_views, scans_of
 

@@ -25,7 +25,7 @@ from splatseg.io.evidence import create_evidence, save_label_map
 from splatseg.io.images import save_png
 from splatseg.lift import GaussianField, TextSpace
 from splatseg.lift.label_maps import has_classifier
-from splatseg.methods.prompt import mask_points
+from splatseg.methods.prompt.views import points_inside
 from splatseg.prompting.prompts import ViewPrompt
 from splatseg_bench.answers import (
     Answer,
@@ -56,6 +56,9 @@ from splatseg_bench.protocols import (
 from splatseg_bench.scene import TargetTask, TrueMask
 
 _LAYER = "layer"
+_POINTS = 8
+"""Points of a mask that a promptable model is given."""
+
 _THING, _REST = 1, 2
 """Ids of a prompt's mask as evidence."""
 
@@ -170,7 +173,8 @@ class TargetRun:
             given = self._prompt(task)
             if given is None:
                 return None
-            asked = {"point": mask_points(given.view, given.mask)}
+            inside = points_inside(given.mask, _POINTS).tolist()
+            asked = {"point": tuple(f"{given.view}:{x:g},{y:g}" for x, y in inside)}
         try:
             layer = self._job.layer(self._method_seen.name, asked=asked)
         except InputError as error:

@@ -16,7 +16,6 @@ from splatseg.core.instance_tree import layer_kind
 from splatseg.errors import InputError
 from splatseg.io.evidence import open_evidence
 from splatseg.io.scene_folder import work_on_scene
-from splatseg.lift.completion import CompletionOptions
 from splatseg.methods import Method, find_method, methods
 from splatseg.report.words import counted
 from splatseg.tasks import (
@@ -32,7 +31,7 @@ from splatseg.tasks import (
 )
 
 CONFIG = (tyro.conf.HelptextFromCommentsOff,)
-"""Options of the method and the shared ones are flags without a prefix, completion's have one."""
+"""Options of the method and the shared ones are flags without a prefix."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -90,9 +89,6 @@ class Command(OnScene):
 
     checkpoint: tyro.conf.OmitArgPrefixes[_Checkpoints] = field(default_factory=_Checkpoints)
     """How a stopped training goes on."""
-
-    completion: CompletionOptions = field(default_factory=CompletionOptions)
-    """How neighbours' labels spread."""
 
     options: Any = None
     """Options of the method."""
@@ -173,7 +169,6 @@ def run(command: Command) -> None:
             method,
             options=command.shared,
             method_options=command.options,
-            completion=command.completion,
             checkpoints=command.checkpoint,
             backend=command.backend,
             observer=observer,

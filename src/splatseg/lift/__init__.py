@@ -8,7 +8,6 @@ from splatseg.lift.boundaries.sharpen import Sharpened as Sharpened
 from splatseg.lift.boundaries.sharpen import SharpenOptions as SharpenOptions
 from splatseg.lift.boundaries.sharpen import sharpen as sharpen
 from splatseg.lift.boundaries.split import split as split
-from splatseg.lift.completion import CompletionOptions as CompletionOptions
 from splatseg.lift.completion import complete as complete
 from splatseg.lift.field import GaussianField as GaussianField
 from splatseg.lift.field import GaussianView as GaussianView

@@ -11,19 +11,13 @@ them.
 with the known ones held at their own shares. The value that arrives for an id is the probability
 that a random walk over the graph first meets evidence for that id.
 
-With ``smoothing`` known Gaussians are averaged with their neighbours too, the more the weaker
-their own evidence e is:
-
-.. math:: x_i \leftarrow \frac{e_i\, y_i + s \sum_j P_{ij} x_j}{e_i + s}
-
 References:
     Zhu and Ghahramani, Learning from Labeled and Unlabeled Data with Label Propagation (2002),
     section 2.2: known nodes are held.
-    Zhou et al., Learning with Local and Global Consistency (2004), eq. 4: known nodes change too.
     Marrie et al., LUDVIG (2024), section 3.3: diffusion on a graph of Gaussians.
 """
 
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -31,10 +25,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from splatseg._check import check_rows
 from splatseg.core import UNLABELLED, Features, Gaussians, Labels
 from splatseg.core.boundary import boundary
-from splatseg.core.options import Count, NonNegative, options
-from splatseg.errors import InputError, ShapeError
 from splatseg.lift.neighbour_graph import (
     NodeAttributes,
     diffuse,
@@ -61,37 +54,15 @@ _MIN_CONFIDENCE = 1e-3
 _MAX_SHARES = 8
 """Shares of a Gaussian that go on from step to step, unless more are to be kept."""
 
-_ONE_WAY = "labels spread 50 steps over the 12 nearest neighbours of like colour"
-
-
-@options(
-    removed=dict.fromkeys(("neighbours", "spread_steps", "colour_width", "feature_width"), _ONE_WAY)
-    | {
-        "own_evidence": "Gaussians with any evidence keep their label",
-        "min_inferred": "the layer has the confidence of inferred labels",
-        "completed_layer": "a soft layer stays soft",
-    }
-)
-class CompletionOptions:
-    """How neighbours' labels spread."""
-
-    smoothing: NonNegative = 0.0
-    """How much the neighbours of a Gaussian count together beside its own evidence, in fully
-    visible pixels; 50 is a good start. 0 leaves labels with evidence as they are."""
-
-    smoothing_steps: Count = 5
-    """Steps over the graph that known labels are smoothed."""
-
 
 @boundary
 def complete(
     gaussians: Gaussians,
     labels: Labels,
     *,
-    options: CompletionOptions | None = None,
     features: Features | None = None,
 ) -> Labels:
-    """Label what has no evidence by its neighbours, and smooth what has little.
+    """Label what has no evidence by its neighbours.
 
     Nothing here is random, and the number of threads changes nothing. Gaussians that were
     inferred before are inferred anew: completing twice gives what completing once gives.
@@ -99,21 +70,17 @@ def complete(
     Args:
         gaussians: The Gaussians of the scene.
         labels: Their layer, hard or soft.
-        options: How labels spread.
         features: What else makes neighbours alike, compared by direction; rows of zeros are
             Gaussians of which nothing is known.
 
     Returns:
-        The layer with `inferred` set where an id comes from neighbours: where there was none, or
-        where smoothing chose another one. Their confidence is the share that arrived. Gaussians
-        that no evidence reaches in 50 steps keep the id -1. The edit in its info says
-        how many there were of each.
+        The layer with `inferred` set where an id comes from neighbours. Their confidence is the
+        share that arrived. Gaussians that no evidence reaches in 50 steps keep the id -1. The edit
+        in its info says how many there were of each.
 
     Raises:
         ShapeError: If the numbers of Gaussians, labels and features differ.
         RangeError: If a value is NaN or infinite.
-        InputError: If smoothing is asked for and the layer does not hold the evidence of each
-            Gaussian.
 
     Example:
         >>> row = torch.arange(4.0).unsqueeze(1) * torch.tensor([[1.0, 0.0, 0.0]])
@@ -125,31 +92,24 @@ def complete(
         >>> complete(g, known).ids
         tensor([5, 5, 5, 5], dtype=torch.int32)
     """
-    options = options or CompletionOptions()
-    _check(gaussians, labels, options, features)
+    _check(gaussians, labels, features)
     known = _known(labels)
     column_ids, shares = _shares(labels, known)
     kept = 1 if labels.candidates is None else labels.candidates.shape[1]
-    shares = _spread(
-        gaussians, labels, shares, known, kept=kept, options=options, features=features
-    )
+    shares = _spread(gaussians, shares, known, max_shares=max(_MAX_SHARES, kept), features=features)
     ids, shares = ranked_ids(shares, column_ids, kept)
-    return _completed(labels, options, known, ids, shares)
+    return _completed(labels, known, ids, shares)
 
 
 def _spread(
     gaussians: Gaussians,
-    labels: Labels,
     shares: Any,
     known: NDArray[np.bool_],
     *,
-    kept: int,
-    options: CompletionOptions,
+    max_shares: int,
     features: Features | None,
 ) -> Any:
-    """Shares after smoothing and label propagation over the neighbour graph, sparse (n, ids)."""
-    max_shares = max(_MAX_SHARES, kept)
-    unknown = np.flatnonzero(~known)
+    """Shares after label propagation over the neighbour graph, sparse (n, ids)."""
     nodes = NodeAttributes(
         positions=gaussians.means.detach().cpu().double().numpy(),
         colours=gaussians.colours.detach().cpu().float().clamp(0, 1).numpy(),
@@ -161,46 +121,17 @@ def _spread(
             neighbours=NEIGHBOURS,
             colour_width=_COLOUR_WIDTH,
             feature_width=_FEATURE_WIDTH,
-            rows=None if options.smoothing > 0 else unknown,
+            rows=np.flatnonzero(~known),
         )
     )
-    if options.smoothing > 0 and labels.evidence is not None:
-        shares = diffuse(
-            transition,
-            shares,
-            np.where(known, labels.evidence.cpu().float().numpy(), 0.0).astype(np.float32),
-            neighbour_weight=options.smoothing,
-            steps=options.smoothing_steps,
-            max_shares=max_shares,
-        )
-        transition = transition[unknown]
-    return diffuse(
-        transition,
-        shares,
-        np.where(known, np.inf, 0.0).astype(np.float32),
-        neighbour_weight=1.0,
-        steps=_SPREAD_STEPS,
-        max_shares=max_shares,
-    )
+    return diffuse(transition, shares, known, steps=_SPREAD_STEPS, max_shares=max_shares)
 
 
-def _check(
-    gaussians: Gaussians, labels: Labels, options: CompletionOptions, features: Features | None
-) -> None:
-    if len(labels) != len(gaussians):
-        raise ShapeError(
-            f"labels: expected {len(gaussians)} rows, one a Gaussian, got {len(labels)}."
-        )
+def _check(gaussians: Gaussians, labels: Labels, features: Features | None) -> None:
+    check_rows("labels", labels, len(gaussians))
     gaussians.check_values()
-    if labels.evidence is None and options.smoothing > 0:
-        raise InputError(
-            "smoothing: expected a layer with the evidence of each Gaussian, got one without; "
-            "make the layer again, or set smoothing to 0."
-        )
-    if features is not None and len(features) != len(gaussians):
-        raise ShapeError(
-            f"features: expected {len(gaussians)} rows, one a Gaussian, got {len(features)}."
-        )
+    if features is not None:
+        check_rows("features", features, len(gaussians))
 
 
 def _known(labels: Labels) -> NDArray[np.bool_]:
@@ -236,33 +167,22 @@ def _shares(labels: Labels, known: NDArray[np.bool_]) -> tuple[NDArray[np.int64]
 
 
 def _completed(
-    labels: Labels,
-    options: CompletionOptions,
-    known: NDArray[np.bool_],
-    spread_ids: Tensor,
-    spread_shares: Tensor,
+    labels: Labels, known: NDArray[np.bool_], spread_ids: Tensor, spread_shares: Tensor
 ) -> Labels:
-    known_rows = torch.from_numpy(known)
-    before = labels.ids.cpu()
-    reached = spread_ids[:, 0] != UNLABELLED
-    # What keeps its label keeps its row untouched, unless it was smoothed.
-    kept = known_rows & ~reached if options.smoothing > 0 else known_rows
-    changed = ~kept & reached
+    kept = torch.from_numpy(known)  # their rows stay untouched
+    inferred = ~kept & (spread_ids[:, 0] != UNLABELLED)
 
     def merged(own: Tensor, spread: Tensor, fill: float) -> Tensor:
         column = (slice(None), None) if own.ndim == 2 else slice(None)
-        return torch.where(kept[column], own.cpu(), torch.where(changed[column], spread, fill))
+        return torch.where(kept[column], own.cpu(), torch.where(inferred[column], spread, fill))
 
-    ids = merged(before, spread_ids[:, 0], UNLABELLED)
-    inferred = changed & (~known_rows | (ids != before))
+    ids = merged(labels.ids, spread_ids[:, 0], UNLABELLED)
     candidates, shares = labels.candidates, labels.shares
     if candidates is not None and shares is not None:
         candidates = merged(candidates, spread_ids, UNLABELLED).to(torch.int32)
         shares = merged(shares.float(), spread_shares, 0.0)
     record = {
-        "options": asdict(options),
-        "inferred": int((inferred & ~known_rows).sum()),
-        "corrected": int((inferred & known_rows).sum()),
+        "inferred": int(inferred.sum()),
         "unreached": int((ids == UNLABELLED).sum()),
     }
     return replace(

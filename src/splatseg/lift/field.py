@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from splatseg._check import check_rows
 from splatseg.core import (
     UNLABELLED,
     Camera,
@@ -31,7 +32,7 @@ from splatseg.core import (
     tree_level,
 )
 from splatseg.core.boundary import boundary
-from splatseg.errors import InputError, ShapeError
+from splatseg.errors import InputError
 from splatseg.lift.label_maps import ClassifierHead, ViewRenderer, has_classifier, view_label_map
 from splatseg.lift.point_labels import PointLabelOptions, classified_points, labels_of_points
 from splatseg.render import PreparedView, RenderOptions, prepare
@@ -234,11 +235,7 @@ class GaussianField:
         self._gaussians = gaussians
         self._layers = dict(layers or {})
         for name, layer in self._layers.items():
-            if len(layer) != len(gaussians):
-                raise ShapeError(
-                    f"layer {name!r}: expected {len(gaussians)} rows, one a Gaussian, "
-                    f"got {len(layer)}."
-                )
+            check_rows(f"layer {name!r}", layer, len(gaussians))
         self._options = options
         self._backend = backend
         self._points = points or PointLabelOptions()

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from splatseg._check import check_choice, check_shape
+from splatseg._check import check_choice, check_rows, check_shape
 from splatseg.core import JSON, UNLABELLED, Camera, Features, Gaussians, LabelMap, Labels, LayerInfo
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, ShapeError
@@ -26,17 +26,13 @@ class ViewRenderer:
 
     def __init__(self, gaussians: Gaussians, view: PreparedView) -> None:
         self._gaussians = gaussians
-        self._view = view
-
-    @property
-    def view(self) -> PreparedView:
+        self.view: PreparedView = view
         """The view itself."""
-        return self._view
 
     @property
     def size(self) -> tuple[int, int]:
         """Height and width."""
-        return self._view.camera.height, self._view.camera.width
+        return self.view.camera.height, self.view.camera.width
 
     def render(
         self, signal: Float[Tensor, "n channels"] | None, *, warp: WarpMode = "bilinear"
@@ -44,7 +40,7 @@ class ViewRenderer:
         """``W @ signal``, on the device of the Gaussians; None is the colour."""
         on_device = None if signal is None else signal.to(self._gaussians.means)
         with torch.no_grad():
-            return self._view.render(on_device, warp=warp)
+            return self.view.render(on_device, warp=warp)
 
     def scores(
         self, signal: Float[Tensor, "n channels"], *, warp: WarpMode = "bilinear"
@@ -92,10 +88,7 @@ def label_map(
     Raises:
         ShapeError: If `labels` has another number of rows than `gaussians`.
     """
-    if len(labels) != len(gaussians):
-        raise ShapeError(
-            f"labels: expected {len(gaussians)} rows, one a Gaussian, got {len(labels)}."
-        )
+    check_rows("labels", labels, len(gaussians))
     with prepare(gaussians, camera, options=options, backend=backend) as view:
         return view_label_map(view, labels)
 

@@ -222,25 +222,19 @@ def transition_matrix(graph: Any) -> Any:
 def diffuse(
     transition: Any,
     shares: Any,
-    own_weight: NDArray[np.float32],
+    known: NDArray[np.bool_],
     *,
-    neighbour_weight: float,
     steps: int,
     max_shares: int,
 ) -> Any:
-    r"""Shares after some steps of diffusion (label propagation).
+    r"""Shares after some steps of label propagation, from known nodes, which keep theirs.
 
-    .. math:: x_i \leftarrow \frac{o_i\, y_i + s \sum_j P_{ij} x_j}{o_i + s}
-
-    for nodes with finite o; a node with infinite o keeps its shares. The fixed point balances
-    a node's own evidence against the shares of its neighbours.
+    .. math:: x_i \leftarrow \sum_j P_{ij} x_j
 
     Args:
-        transition: The rows of P of nodes with finite o, sparse (free, n); they add up to at most
-            1.
-        shares: y, sparse (n, ids), rows that add up to at most 1.
-        own_weight: o, (n,): how much a node's own shares count; 0 for a node without evidence.
-        neighbour_weight: s, how much neighbours count, positive.
+        transition: The rows of P of unknown nodes, sparse (unknown, n); they add up to at most 1.
+        shares: Those of known nodes, sparse (n, ids), rows that add up to at most 1.
+        known: (n,).
         steps: How often.
         max_shares: Largest shares of a node that are carried on, at least 1.
 
@@ -249,28 +243,13 @@ def diffuse(
     """
     import scipy.sparse
 
-    clamped = np.isinf(own_weight)
-    free_rows, clamped_rows = np.flatnonzero(~clamped), np.flatnonzero(clamped)
+    free_rows, clamped_rows = np.flatnonzero(~known), np.flatnonzero(known)
     if not len(free_rows):
         return shares
-    free_weight = own_weight[free_rows].astype(np.float64)
-    factor = (neighbour_weight / (free_weight + neighbour_weight)).astype(np.float32)
     transition.sort_indices()
-    free_transition: Any = scipy.sparse.csr_matrix(
-        (
-            transition.data * np.repeat(factor, np.diff(transition.indptr)),
-            transition.indices,
-            transition.indptr,
-        ),
-        shape=transition.shape,
-    )
-    # The part of free nodes' own shares and of clamped neighbours never changes.
-    source = (
-        scipy.sparse.diags((free_weight / (free_weight + neighbour_weight)).astype(np.float32))
-        @ shares[free_rows]
-    )
-    source = (source + free_transition[:, clamped_rows] @ shares[clamped_rows]).tocsr()
-    free_transition = free_transition[:, free_rows].tocsr()
+    # The part of known neighbours never changes.
+    source = (transition[:, clamped_rows] @ shares[clamped_rows]).tocsr()
+    free_transition = transition[:, free_rows].tocsr()
     current = shares[free_rows]
     for _ in range(steps):
         current = scipy.sparse.vstack(

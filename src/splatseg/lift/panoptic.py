@@ -23,9 +23,10 @@ from jaxtyping import Float, Int64
 from numpy.typing import NDArray
 from torch import Tensor
 
+from splatseg._check import check_rows
 from splatseg.core import UNLABELLED, ClassTable, Gaussians, InstanceFacts, Labels, LayerInfo
 from splatseg.core.boundary import boundary
-from splatseg.errors import InputError, ShapeError
+from splatseg.errors import InputError
 from splatseg.neighbours import NeighbourIndex
 
 _NEIGHBOURS = 12
@@ -69,10 +70,7 @@ def merge_panoptic(
         tensor([ 5,  5, 10, 10], dtype=torch.int32)
     """
     for name, layer in (("instances", instances), ("classes", classes)):
-        if len(layer) != len(gaussians):
-            raise ShapeError(
-                f"{name}: expected {len(gaussians)} rows, one a Gaussian, got {len(layer)}."
-            )
+        check_rows(f"{name}", layer, len(gaussians))
     kinds = classes.ids.cpu().long()
     if not bool((kinds != UNLABELLED).any()):
         raise InputError("classes: expected a layer with labels, got one without.")

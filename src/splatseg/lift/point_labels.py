@@ -23,7 +23,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from splatseg._check import check_finite, check_shape
+from splatseg._check import check_finite, check_rows, check_shape
 from splatseg.core import UNLABELLED, Features, Gaussians, PointLabels
 from splatseg.core.boundary import boundary
 from splatseg.core.options import Positive, Share, options
@@ -131,10 +131,7 @@ def classified_points(
         InputError: If no Gaussian is opaque enough.
     """
     check_shape("points", points, (None, 3))
-    if len(features) != len(gaussians):
-        raise ShapeError(
-            f"features: expected {len(gaussians)} rows, one a Gaussian, got {len(features)}."
-        )
+    check_rows("features", features, len(gaussians))
     values = features.values.cpu()
     weights = None if features.weights is None else features.weights.cpu()
     out = torch.full((len(points),), UNLABELLED, dtype=torch.int32)

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
+from splatseg._check import check_rows
 from splatseg.core import (
     UNLABELLED,
     Gaussians,
@@ -21,7 +22,7 @@ from splatseg.core import (
 )
 from splatseg.core.boundary import convert_fields
 from splatseg.core.options import Share
-from splatseg.errors import InputError, ShapeError
+from splatseg.errors import InputError
 from splatseg.io.evidence import Evidence, PanopticEvidence, TrackedEvidence
 from splatseg.lift.label_maps import label_map
 
@@ -142,11 +143,7 @@ class MatchedMaps:
 
     def __post_init__(self) -> None:
         convert_fields(self)
-        if len(self.labels) != len(self.gaussians):
-            raise ShapeError(
-                f"labels: expected {len(self.gaussians)} rows, one a Gaussian, "
-                f"got {len(self.labels)}."
-            )
+        check_rows("labels", self.labels, len(self.gaussians))
 
     @property
     def view_names(self) -> Sequence[str]:

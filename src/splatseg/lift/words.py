@@ -263,48 +263,34 @@ class WordIndex:
         if not bool(known.any()):
             raise InputError("features: expected a feature of at least one Gaussian, got none.")
         rows, self._rows = _distinct(values, known)
-        self._values = values[rows]
+        self.values = values[rows]
+        """The vectors, in the channels of the features."""
         # A row of zeros after the last stands for Gaussians without a vector: one gather is enough.
         self._padded = torch.where(self._rows < 0, len(rows), self._rows)
         counted = torch.ones(len(values)) if weights is None else weights.cpu().float()
-        self._weights = torch.zeros(len(rows), dtype=torch.float64)
-        self._weights.index_add_(0, self._rows[known], counted[known].double())
-        self._vocabulary = vocabulary
-        self._span = word_span(self._values, self._weights, vocabulary.space, components=components)
+        self.weights = torch.zeros(len(rows), dtype=torch.float64)
+        """What each vector rests on, summed over its Gaussians."""
+        self.weights.index_add_(0, self._rows[known], counted[known].double())
+        self.vocabulary: Vocabulary = vocabulary
+        """Words that can be asked for."""
+        self.span: WordSpan = word_span(
+            self.values, self.weights, vocabulary.space, components=components
+        )
+        """Where words are compared."""
 
     def __len__(self) -> int:
         """How many distinct vectors there are."""
-        return len(self._values)
+        return len(self.values)
 
     @property
     def rows(self) -> Int64[Tensor, "n"]:
         """Of each Gaussian the row of its vector, -1 where it has none."""
         return self._rows
 
-    @property
-    def weights(self) -> Float[Tensor, "k"]:
-        """What each vector rests on, summed over its Gaussians."""
-        return self._weights
-
-    @property
-    def values(self) -> Float[Tensor, "k channels"]:
-        """The vectors, in the channels of the features."""
-        return self._values
-
-    @property
-    def span(self) -> WordSpan:
-        """Where words are compared."""
-        return self._span
-
-    @property
-    def vocabulary(self) -> Vocabulary:
-        """Words that can be asked for."""
-        return self._vocabulary
-
     @boundary
     def ask(self, words: Sequence[str]) -> WordAnswers:
         """What each vector answers, see `answer_words`."""
-        return answer_words(self._values, words, self._vocabulary, self._span)
+        return answer_words(self.values, words, self.vocabulary, self.span)
 
     @boundary
     def of_gaussians(self, found: Shaped[Tensor, "k words"]) -> Shaped[Tensor, "n words"]:

@@ -13,6 +13,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from splatseg.core import (
+    JSON,
     LEARNED_BYTES,
     LOSS_CURVE,
     ClassTable,
@@ -20,13 +21,11 @@ from splatseg.core import (
     Gaussians,
     Labels,
     LabelSource,
-    Layer,
     LayerInfo,
     View,
 )
 from splatseg.core.checkpoints import Checkpoints
 from splatseg.core.options import Share, options
-from splatseg.errors import RangeError
 from splatseg.lift.label_maps import ClassifierHead
 from splatseg.lift.training import (
     LabelTargets,
@@ -38,7 +37,6 @@ from splatseg.lift.training import (
 )
 from splatseg.lift.voting.uplift import names_of, voting_views
 from splatseg.methods._method import MethodInputs
-from splatseg.render import RenderOptions
 
 
 @options
@@ -51,16 +49,6 @@ class LabelTrainingOptions(RowTrainingOptions):
 
     min_share: Share = 0.0
     """Minimum probability, in [0, 1], of a Gaussian's id; below it there is no label."""
-
-
-def check_rate(name: str, value: float) -> None:
-    """Refuse a rate or weight below 0.
-
-    Raises:
-        RangeError: If it is below 0 or not finite.
-    """
-    if not (math.isfinite(value) and value >= 0):
-        raise RangeError(f"{name}: expected 0 or more, got {value}.")
 
 
 TINY = 1e-10
@@ -158,9 +146,6 @@ _NOT_TRAINED = ("readout", "min_share", "memory")
 class TrainingContext:
     """What a training on label maps gets besides its data and options."""
 
-    render_options: RenderOptions | None = None
-    """Switches of the blending model."""
-
     backend: str = "auto"
     """Name of the rendering backend."""
 
@@ -206,7 +191,6 @@ def label_data(
         ordered,
         source,
         options=options.drawing(),
-        render_options=context.render_options,
         backend=context.backend,
     )
     return LabelData(sampler=sampler, ids=source.ids, views=ordered)
@@ -280,46 +264,21 @@ def layer_info(
         names=names_of(classes, data.ids.tolist()),
         seed=seed,
         head=head.to_json(),
-        details={
-            "loss": float(np.mean(result.losses[-20:])),
-            "steps": len(result.losses),
-            "best_step": result.best_step,
-            "stopped": result.stopped,
-            "scores": [[step, score] for step, score in result.scores],
-            LOSS_CURVE: loss_curve(result.losses),
-            LEARNED_BYTES: result.learned_bytes,
-        },
+        details=training_details(result),
     )
 
 
-def features_layer(
-    values: Float[Tensor, "n channels"], result: TrainingResult, info: LayerInfo
-) -> Features:
-    """Trained values as a layer; Gaussians that no drawn pixel shows have a weight of 0."""
-    return Features(values=values, weights=result.visibility, info=info)
-
-
-def runner(train_features: Callable[..., Features]) -> Callable[[MethodInputs, Any], Layer]:
-    """The `Method.run` of a method that trains features with a head.
-
-    Args:
-        train_features: Takes Gaussians, views and evidence, and by keyword the options, the
-            names of classes and a `TrainingContext`.
-    """
-
-    def run(inputs: MethodInputs, options: LabelTrainingOptions) -> Layer:
-        """Train, and read the features as the options say."""
-        features = train_features(
-            inputs.gaussians,
-            inputs.views,
-            inputs.evidence,
-            options=options,
-            classes=inputs.label_names,
-            context=context_of(inputs),
-        )
-        return features if options.readout == "rendered" else hard_labels(features, options)
-
-    return run
+def training_details(result: TrainingResult) -> dict[str, JSON]:
+    """How a training went, for the info of a layer."""
+    return {
+        "loss": float(np.mean(result.losses[-20:])),
+        "steps": len(result.losses),
+        "best_step": result.best_step,
+        "stopped": result.stopped,
+        "scores": [[step, score] for step, score in result.scores],
+        LOSS_CURVE: loss_curve(result.losses),
+        LEARNED_BYTES: result.learned_bytes,
+    }
 
 
 def context_of(inputs: MethodInputs) -> TrainingContext:

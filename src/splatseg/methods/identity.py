@@ -36,24 +36,23 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 from torch.nn.functional import embedding
 
-from splatseg.core import ClassTable, Features, Gaussians, Labels, LabelSource, View
+from splatseg.core import ClassTable, Features, Gaussians, Labels, LabelSource, Layer, View
 from splatseg.core.options import Count, NonNegative, options
 from splatseg.core.sh import SH_C0
 from splatseg.lift.label_maps import Blend, ClassifierHead
 from splatseg.lift.training import Batch, Parameter, Values
-from splatseg.methods._method import Method
+from splatseg.methods._method import Method, MethodInputs
 from splatseg.methods._trained import (
     TINY,
     LabelCounts,
     LabelTrainingOptions,
-    features_layer,
+    context_of,
     hard_labels,
     label_data,
     layer_info,
     linear_start,
     logit_loss,
     probability_loss,
-    runner,
     train_labels,
 )
 from splatseg.methods._trained import TrainingContext as TrainingContext
@@ -257,22 +256,16 @@ class IdentityModel:
         start = (rng.random((len(means), options.channels), dtype=np.float32) - 0.5) / SH_C0
         weight, bias = linear_start(options.channels, classes, rng)
         self._options = options
-        self._rows = {"features": Parameter(start=torch.from_numpy(start), rate=options.rate)}
-        self._shared = {
+        self.row_parameters: Mapping[str, Parameter] = {
+            "features": Parameter(start=torch.from_numpy(start), rate=options.rate)
+        }
+        """``features``."""
+        self.shared_parameters: Mapping[str, Parameter] = {
             "weight": Parameter(start=weight, rate=options.classifier_rate),
             "bias": Parameter(start=bias, rate=options.classifier_rate),
         }
-        self._neighbours = NeighbourLoss(means, rng) if options.kl_weight > 0 else None
-
-    @property
-    def row_parameters(self) -> Mapping[str, Parameter]:
-        """``features``."""
-        return self._rows
-
-    @property
-    def shared_parameters(self) -> Mapping[str, Parameter]:
         """The classifier: ``weight`` and ``bias``."""
-        return self._shared
+        self._neighbours = NeighbourLoss(means, rng) if options.kl_weight > 0 else None
 
     def loss(self, batch: Batch, values: Values) -> Float[Tensor, ""]:
         """The pixel term, and every so often the neighbour term."""
@@ -388,7 +381,20 @@ def train_identity(
     info = layer_info(
         "identity", asdict(options), data, result, head=head, classes=classes, seed=context.seed
     )
-    return features_layer(result.rows["features"], result, info)
+    return Features(values=result.rows["features"], weights=result.visibility, info=info)
+
+
+def run(inputs: MethodInputs, options: IdentityOptions) -> Layer:
+    """Train, and read the features as the options say."""
+    features = train_identity(
+        inputs.gaussians,
+        inputs.views,
+        inputs.evidence,  # pyright: ignore[reportArgumentType]  (of a kind that it takes)
+        options=options,
+        classes=inputs.label_names,
+        context=context_of(inputs),
+    )
+    return features if options.readout == "rendered" else hard_labels(features, options)
 
 
 METHOD = Method(
@@ -397,7 +403,7 @@ METHOD = Method(
     reference="Gaussian Grouping (Ye et al. 2024), eq. 3 to 5",
     evidence=("labels", "tracked"),
     options=IdentityOptions,
-    run=runner(train_identity),
+    run=run,
     keeps_ids=True,
     seeded=True,
     resumes=True,

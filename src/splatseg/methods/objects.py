@@ -51,7 +51,6 @@ from splatseg.lift.voting.features import camera_of_grid, checked_grid
 from splatseg.lift.voting.uplift import voting_views
 from splatseg.methods._method import Method, MethodInputs
 from splatseg.methods.associate import associate
-from splatseg.render import RenderOptions
 
 BLURS = (0.0, 0.5, 0.7, 1.0, 1.4, 2.0)
 """Standard deviations, in cells, of which the one with the least residual is taken."""
@@ -156,7 +155,6 @@ def object_features(
     evidence: FeatureSource,
     objects: Labels,
     *,
-    render_options: RenderOptions | None = None,
     backend: str = "auto",
     progress: Callable[[int, int], None] | None = None,
 ) -> ObjectFeatures:
@@ -170,7 +168,6 @@ def object_features(
         views: Those whose features are used.
         evidence: Their feature maps, as `lift.mass.features.uplift_features` takes them.
         objects: Which object each Gaussian is of; -1 is none.
-        render_options: Switches of the blending model.
         backend: Name of the rendering backend.
         progress: Called with the views done and all there are.
 
@@ -197,7 +194,7 @@ def object_features(
                 f"view {ordered[0].name}, got {grid.channels}."
             )
         _, camera = camera_of_grid(view, grid)
-        found = label_map(gaussians, camera, hard, options=render_options, backend=backend).ids
+        found = label_map(gaussians, camera, hard, backend=backend).ids
         model.add(_rows_of(found, ids).numpy(), grid)
         if progress is not None:
             progress(done + 1, len(ordered))

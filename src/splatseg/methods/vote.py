@@ -242,10 +242,9 @@ def _collected(
     for done, view in enumerate(ordered):
         label_map = evidence.label_map(view.name)
         camera = camera_of_map(view, label_map.height, label_map.width)
-        votes = voter.view_votes(camera, label_map)
-        labelled = votes.ids != UNLABELLED
-        table.add_sparse(votes.ids[labelled], votes.gaussians[labelled], votes.weights[labelled])
-        ids.update(torch.unique(votes.ids[labelled]).tolist())
+        found, gaussians, weights = voter.view_votes(camera, label_map)
+        table.add_sparse(found, gaussians, weights)
+        ids.update(torch.unique(found).tolist())
         if progress is not None:
             progress(done + 1, len(ordered))
     if not ids and count:
@@ -257,15 +256,6 @@ def _collected(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _ViewVotes:
-    """Votes of one view: at most one id a Gaussian, -1 for an unlabelled pixel."""
-
-    gaussians: Tensor
-    ids: Tensor
-    weights: Tensor
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _CentreVoter:
     """Reads label maps at the pixels of the centres of Gaussians."""
 
@@ -274,7 +264,8 @@ class _CentreVoter:
     render_options: RenderOptions
     backend: str
 
-    def view_votes(self, camera: Camera, label_map: LabelMap) -> _ViewVotes:
+    def view_votes(self, camera: Camera, label_map: LabelMap) -> tuple[Tensor, Tensor, Tensor]:
+        """Ids, Gaussians and weights of the votes of a view; unlabelled pixels have none."""
         centres = centres_in(self.gaussians.means, camera, near=self.render_options.near)
         with prepare(
             self.gaussians, camera, options=self.render_options, backend=self.backend
@@ -286,10 +277,9 @@ class _CentreVoter:
             vote_weight = weight
         if label_map.confidence is not None:
             vote_weight = vote_weight * label_map.confidence.cpu().float()[row, column]
-        ids = label_map.ids.cpu()
-        return _ViewVotes(
-            gaussians=centres.gaussians, ids=ids[row, column].long(), weights=vote_weight
-        )
+        ids = label_map.ids.cpu()[row, column].long()
+        labelled = ids != UNLABELLED
+        return ids[labelled], centres.gaussians[labelled], vote_weight[labelled]
 
     def _seen(self, centres: Centres, view: PreparedView) -> tuple[Centres, Tensor]:
         """The centres that pass the occlusion test, and their weights where they are needed."""

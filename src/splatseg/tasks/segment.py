@@ -25,7 +25,7 @@ from splatseg.errors import InputError
 from splatseg.io.arrays import discard_checkpoint_file
 from splatseg.io.evidence import Evidence
 from splatseg.io.scene import check_name, save_scene_layer
-from splatseg.lift.completion import CompletionOptions, complete
+from splatseg.lift.completion import complete
 from splatseg.lift.panoptic import merge_panoptic
 from splatseg.methods import Method, MethodInputs, Refined, find_method
 from splatseg.render import BackendName
@@ -139,7 +139,6 @@ def segment(
     *,
     options: SegmentOptions | None = None,
     method_options: Any = None,
-    completion: CompletionOptions | None = None,
     checkpoints: CheckpointOptions | None = None,
     layers: Mapping[str, Layer] | None = None,
     backend: BackendName = "auto",
@@ -156,7 +155,6 @@ def segment(
         options: Which evidence and views, and what follows the method.
         method_options: An instance of the method's options; None is its default, or the
             published setting where `options` ask for it.
-        completion: How neighbours' labels spread.
         checkpoints: How often a method that trains keeps its state in the scene's folder, and
             whether it goes on from there. What ends it early leaves a checkpoint; None keeps none.
         layers: Layers at hand; others are read from the scene's folder.
@@ -175,7 +173,6 @@ def segment(
         method,
         options or SegmentOptions(),
         method_options=method_options,
-        completion=completion,
         checkpoints=checkpoints,
     )
 
@@ -186,7 +183,6 @@ def segment_work(
     options: SegmentOptions,
     *,
     method_options: Any = None,
-    completion: CompletionOptions | None = None,
     checkpoints: CheckpointOptions | None = None,
 ) -> Segmentation:
     """`segment` of a scene that is open."""
@@ -240,7 +236,7 @@ def segment_work(
             layer = layer.layer
         if options.complete and method.complete and not options.published:
             began = time.monotonic()
-            layer = _completed(scene, layer, completion)
+            layer = _completed(scene, layer)
             timings["complete"] = time.monotonic() - began
         if merged is not None:
             layer = _panoptic(scene, layer, merged, method)
@@ -322,12 +318,12 @@ def _method_options(method: Method, given: Any, options: SegmentOptions) -> Any:
     return given
 
 
-def _completed(scene: Scene, layer: Layer, completion: CompletionOptions | None) -> Layer:
+def _completed(scene: Scene, layer: Layer) -> Layer:
     """The layer with labels for Gaussians that have none, where it is one of labels."""
     labels = layer.labels if isinstance(layer, InstanceTree) else layer
     if not isinstance(labels, Labels) or not bool((labels.ids != UNLABELLED).any()):
         return layer
-    labels = complete(scene.gaussians, labels, options=completion)
+    labels = complete(scene.gaussians, labels)
     return replace(layer, labels=labels) if isinstance(layer, InstanceTree) else labels
 
 

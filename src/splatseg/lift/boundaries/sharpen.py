@@ -114,7 +114,6 @@ def sharpen(
     evidence: LabelSource,
     *,
     options: SharpenOptions | None = None,
-    uplift_options: UpliftOptions | None = None,
     confusion: ConfusionOptions | None = DEFAULT_CONFUSION,
     fit_options: FitOptions | None = None,
     exposures: Mapping[str, Exposure] | None = None,
@@ -133,8 +132,6 @@ def sharpen(
         evidence: Their label maps, with ids that mean the same in all views (`MatchedMaps` for
             segments); pixels at -1 do not count.
         options: How long, and how much labels count.
-        uplift_options: How Gaussians get labels; candidates are at least 8 where confusion
-            is corrected.
         confusion: How the evidence errs, see `correct_confusion`; None takes the majority.
         fit_options: How the photographs are compared (see `refinement_options`), and rates. Its
             seed is not used, and the poses of the views stay as they are: the label maps are
@@ -153,9 +150,7 @@ def sharpen(
     update = _LabelUpdate(
         views=_photographed(views, evidence),
         label_maps=_CachedLabelMaps(evidence),
-        votes=(uplift_options or UpliftOptions()).with_candidates(
-            2 if confusion is None else CANDIDATES
-        ),
+        votes=UpliftOptions(candidates=2 if confusion is None else CANDIDATES),
         confusion=confusion,
         backend=backend,
     )

@@ -164,6 +164,9 @@ _GRID_END = 4.0
 
 _GRID_NODES = 81
 _GAUSS_NEWTON_STEPS = 24
+_ALPHA_MAX = 0.99
+"""Largest alpha of the blending model."""
+
 _REGULARISATION = 1e-3
 """Pull towards o w / r_rho, as a part of the normal matrix' trace: where parts lie over each
 other (rho near 0) any opacities with the same sum look alike, and those are taken."""
@@ -242,8 +245,6 @@ def opacities_of_parts(
     opacities: Float[Tensor, "n"],
     across: Float[Tensor, "n"],
     mixture: Mixture,
-    *,
-    alpha_max: float = 0.99,
 ) -> Float[Tensor, "n parts"]:
     r"""Opacities of the parts of Gaussians so that the parts together look like them.
 
@@ -251,19 +252,18 @@ def opacities_of_parts(
         opacities: Of the Gaussians, in [0, 1].
         across: :math:`\rho`, how much of the split direction the views show, in [0, 1].
         mixture: How they are split.
-        alpha_max: Largest alpha of the blending model.
 
     Returns:
         :math:`o_c` of each part, in [0, 1], in the order of the offsets.
     """
     batches = zip(opacities.double().split(_ROWS), across.double().split(_ROWS), strict=True)
-    blocks = [_solved(o, rho, mixture, alpha_max) for o, rho in batches]
+    blocks = [_solved(o, rho, mixture) for o, rho in batches]
     if not blocks:
         return opacities.new_zeros(0, len(mixture.offsets))
     return torch.cat(blocks).to(opacities)
 
 
-def _solved(o: Tensor, rho: Tensor, mixture: Mixture, alpha_max: float) -> Tensor:
+def _solved(o: Tensor, rho: Tensor, mixture: Mixture) -> Tensor:
     weights = torch.tensor(mixture.weights, dtype=o.dtype)
     offsets = torch.tensor(mixture.offsets, dtype=o.dtype)
     u = torch.linspace(-_GRID_END, _GRID_END, _GRID_NODES, dtype=o.dtype)
@@ -271,7 +271,7 @@ def _solved(o: Tensor, rho: Tensor, mixture: Mixture, alpha_max: float) -> Tenso
     # Axes: Gaussian, node, part.
     distance = (u[None, :, None] - rho[:, None, None] * offsets) / width[:, None, None]
     densities = torch.exp(-0.5 * distance**2)
-    wanted = (o[:, None] * torch.exp(-0.5 * u**2)).clamp_max(alpha_max)
+    wanted = (o[:, None] * torch.exp(-0.5 * u**2)).clamp_max(_ALPHA_MAX)
     mirrored = _mirror_pairs(len(offsets)).to(o)
     # One unknown a mirrored pair: its opacity.
     start = ((o / width)[:, None] * weights) @ mirrored.T / mirrored.sum(dim=1)
@@ -279,8 +279,8 @@ def _solved(o: Tensor, rho: Tensor, mixture: Mixture, alpha_max: float) -> Tenso
     eye = torch.eye(len(mirrored), dtype=o.dtype)
     for _ in range(_GAUSS_NEWTON_STEPS):
         alpha = (solution @ mirrored)[:, None, :] * densities
-        free = alpha < alpha_max
-        alpha = alpha.clamp_max(alpha_max)
+        free = alpha < _ALPHA_MAX
+        alpha = alpha.clamp_max(_ALPHA_MAX)
         transmittance = torch.prod(1 - alpha, dim=-1, keepdim=True)
         jacobian = (transmittance / (1 - alpha) * torch.where(free, densities, 0.0)) @ mirrored.T
         residual = (1 - transmittance).squeeze(-1) - wanted

@@ -27,6 +27,7 @@ from splatseg.lift.training._targets import Ragged as Ragged
 from splatseg.lift.training._targets import Target as Target
 from splatseg.lift.training._targets import Targets as Targets
 from splatseg.lift.training._targets import TargetSource as TargetSource
+from splatseg.lift.training._targets import TensorBudget as TensorBudget
 from splatseg.lift.training._train import Model as Model
 from splatseg.lift.training._train import Parameter as Parameter
 from splatseg.lift.training._train import TrainingResult as TrainingResult

@@ -19,15 +19,14 @@ from splatseg.lift.training._options import SamplingOptions
 from splatseg.lift.training._targets import (
     DrawnView,
     Ragged,
-    RowStore,
     Target,
     Targets,
     TargetSource,
+    TensorBudget,
 )
 from splatseg.lift.voting.uplift import voting_views
 from splatseg.render import (
     CompactRows,
-    RenderOptions,
     SparseWeights,
     get_backend,
     options_for,
@@ -242,8 +241,11 @@ class DrawnRows:
     """
 
     @boundary
-    def __init__(self, store: RowStore, groups: Sequence[BatchGroup]) -> None:
-        self._store = store
+    def __init__(
+        self, views: Sequence[DrawnView], budget: TensorBudget, groups: Sequence[BatchGroup]
+    ) -> None:
+        self._views = views
+        self._budget = budget
         self._groups = groups
         self._batches = [(group, index) for group in groups for index in range(group.count)]
 
@@ -262,7 +264,7 @@ class DrawnRows:
         group, position = self._batches[index]
         parts, views = [], []
         for view, offset in zip(group.views, group.offsets, strict=True):
-            drawn = self._store[view]
+            drawn = self._views[view]
             begin, end = group.span(len(drawn), offset, position)
             if end > begin:
                 parts.append(drawn.slice(begin, end))
@@ -302,15 +304,15 @@ class DrawnRows:
         Each drawn pixel counts as many as it stands for.
         """
         total = torch.zeros(count)
-        for view in range(len(self._store)):
-            drawn = self._store[view]
+        for drawn in self._views:
             each = torch.repeat_interleave(drawn.stands_for, torch.diff(drawn.rows.indptr))
             total.index_add_(0, drawn.rows.ids.int(), drawn.rows.weights.float() * each)
         return total
 
     def close(self) -> None:
         """Forget the rows and remove the files."""
-        self._store.close()
+        self._views = ()
+        self._budget.close()
 
 
 class RowSampler:
@@ -321,7 +323,6 @@ class RowSampler:
         views: Those to learn from.
         source: What there is to learn.
         options: Which pixels are drawn.
-        render_options: Switches of the blending model.
         backend: Name of the rendering backend.
 
     Raises:
@@ -336,15 +337,15 @@ class RowSampler:
         source: TargetSource,
         *,
         options: SamplingOptions | None = None,
-        render_options: RenderOptions | None = None,
         backend: str = "auto",
     ) -> None:
         self._views = voting_views(views, source, "targets")
         gaussians.check_values()
         self._gaussians = gaussians
         self._source = source
-        self._options = options or SamplingOptions()
-        self._render_options = render_options or options_for(gaussians, backend)
+        self.options: SamplingOptions = options or SamplingOptions()
+        """Which pixels are drawn."""
+        self._render_options = options_for(gaussians, backend)
         self._backend = backend
 
     @property
@@ -363,15 +364,9 @@ class RowSampler:
             self._gaussians,
             views,
             self._source,
-            options=self._options,
-            render_options=self._render_options,
+            options=self.options,
             backend=self._backend,
         )
-
-    @property
-    def options(self) -> SamplingOptions:
-        """Which pixels are drawn."""
-        return self._options
 
     @property
     def backend(self) -> str:
@@ -411,20 +406,24 @@ class RowSampler:
             InputError: If no view has anything to learn.
             SplatsegError: If rows beyond the memory budget cannot be written.
         """
-        store = RowStore(self._options.memory)
+        budget = TensorBudget(self.options.memory)
+        found: list[DrawnView] = []
         try:
             for view in self._views:
-                store.append(self._drawn(view, rng, pixels or self._options.pixels))
+                drawn = self._drawn(view, rng, pixels or self.options.pixels)
+                found.append(drawn.with_tensors(budget.kept(drawn.tensors())))
         except BaseException:
-            store.close()
+            found.clear()
+            budget.close()
             raise
-        sizes = [len(store[i]) for i in range(len(store))]
+        sizes = [len(drawn) for drawn in found]
         if not sum(sizes):
-            raise InputError(f"views: expected something to learn in {len(store)}, found none.")
-        return DrawnRows(store, batch_groups(sizes, batch, self._options.views_per_batch, rng))
+            raise InputError(f"views: expected something to learn in {len(found)}, found none.")
+        groups = batch_groups(sizes, batch, self.options.views_per_batch, rng)
+        return DrawnRows(found, budget, groups)
 
     def _drawn(self, view: View, rng: np.random.Generator, count: int) -> DrawnView:
-        source, options = self._source, self._options
+        source, options = self._source, self.options
         choice = source.choice(view.name)
         if choice.grid:
             camera = view.camera.resized(choice.width, choice.height)

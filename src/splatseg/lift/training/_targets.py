@@ -146,10 +146,11 @@ class LabelTargets:
     @boundary
     def __init__(self, evidence: LabelSource, names: Sequence[str]) -> None:
         self._evidence = evidence
-        self._names = tuple(sorted(names))
+        self.view_names: Sequence[str] = tuple(sorted(names))
+        """The views to learn from."""
         digest = hashlib.sha256()
         found: set[int] = set()
-        for name in self._names:
+        for name in self.view_names:
             label_map = evidence.label_map(name)
             digest.update(repr((name, label_map.height, label_map.width)).encode())
             digest.update(label_map.ids.cpu().numpy().tobytes())
@@ -159,26 +160,13 @@ class LabelTargets:
         found.discard(UNLABELLED)
         if not found:
             raise InputError(
-                f"evidence: expected a labelled pixel in {len(self._names)} views, found none."
+                f"evidence: expected a labelled pixel in {len(self.view_names)} views, found none."
             )
-        self._ids = torch.tensor(sorted(found))
-        self._last: tuple[str, LabelMap] | None = None
-        self._fingerprint = digest.hexdigest()
-
-    @property
-    def ids(self) -> Int64[Tensor, "classes"]:
+        self.ids = torch.tensor(sorted(found))
         """All ids, ascending."""
-        return self._ids
-
-    @property
-    def view_names(self) -> Sequence[str]:
-        """The views to learn from."""
-        return self._names
-
-    @property
-    def fingerprint(self) -> str:
+        self._last: tuple[str, LabelMap] | None = None
+        self.fingerprint: str = digest.hexdigest()
         """A digest of all maps."""
-        return self._fingerprint
 
     def choice(self, name: str) -> PixelChoice:
         """Labelled pixels."""
@@ -201,7 +189,7 @@ class LabelTargets:
         confidence = torch.ones(len(pixels))
         if label_map.confidence is not None:
             confidence = label_map.confidence.cpu().float().reshape(-1)[pixels]
-        return {"label": torch.searchsorted(self._ids, flat[pixels]), "confidence": confidence}
+        return {"label": torch.searchsorted(self.ids, flat[pixels]), "confidence": confidence}
 
     def _label_map(self, name: str) -> LabelMap:
         """The map of a view; that of the last one asked for is still there."""
@@ -227,27 +215,21 @@ class MaskTargets:
     @boundary
     def __init__(self, evidence: MaskSets, names: Sequence[str]) -> None:
         self._evidence = evidence
-        self._names = tuple(sorted(names))
+        self.view_names: Sequence[str] = tuple(sorted(names))
+        """The views to learn from."""
         digest, some = hashlib.sha256(), False
-        for name in self._names:
+        for name in self.view_names:
             masks = evidence.masks(name)
             digest.update(repr((name, masks.height, masks.width)).encode())
             for mask in masks.masks:
                 digest.update(np.asarray(mask.counts, dtype=np.int64).tobytes())
                 some = some or mask.area > 0
         if not some:
-            raise InputError(f"evidence: expected a mask in {len(self._names)} views, found none.")
-        self._fingerprint = digest.hexdigest()
-
-    @property
-    def view_names(self) -> Sequence[str]:
-        """The views to learn from."""
-        return self._names
-
-    @property
-    def fingerprint(self) -> str:
+            raise InputError(
+                f"evidence: expected a mask in {len(self.view_names)} views, found none."
+            )
+        self.fingerprint: str = digest.hexdigest()
         """A digest of all masks."""
-        return self._fingerprint
 
     def choice(self, name: str) -> PixelChoice:
         """All pixels."""
@@ -304,48 +286,27 @@ class DrawnView:
             targets={name: _slice(target, begin, end) for name, target in self.targets.items()},
         )
 
-    def arrays(self) -> dict[str, Tensor]:
-        """All tensors by the names they are filed under."""
-        found = {
-            "rows.indptr": self.rows.indptr,
-            "rows.ids": self.rows.ids,
-            "rows.weights": self.rows.weights,
-            "pixels": self.pixels,
-            "stands_for": self.stands_for,
-        }
-        for name, target in self.targets.items():
-            if isinstance(target, Ragged):
-                found[f"targets.{name}.starts"] = target.starts
-                found[f"targets.{name}.values"] = target.values
-            else:
-                found[f"targets.{name}"] = target
+    def tensors(self) -> list[Tensor]:
+        """All tensors, in the order that `with_tensors` takes them."""
+        found = [self.rows.indptr, self.rows.ids, self.rows.weights, self.pixels, self.stands_for]
+        for target in self.targets.values():
+            found += (target.starts, target.values) if isinstance(target, Ragged) else (target,)
         return found
 
-    def with_arrays(self, arrays: dict[str, Tensor]) -> "DrawnView":
-        """The same with tensors of the same values in other memory. Inverse of `arrays`."""
-
-        def target(name: str, value: Target) -> Target:
-            if isinstance(value, Ragged):
-                starts, values = (arrays[f"targets.{name}.{part}"] for part in ("starts", "values"))
-                return Ragged(starts=starts, values=values)
-            return arrays[f"targets.{name}"]
-
+    def with_tensors(self, tensors: Sequence[Tensor]) -> "DrawnView":
+        """The same with tensors of the same values in other memory."""
+        left = iter(tensors)
         return DrawnView(
-            rows=replace(
-                self.rows,
-                indptr=arrays["rows.indptr"],
-                ids=arrays["rows.ids"],
-                weights=arrays["rows.weights"],
-            ),
-            pixels=arrays["pixels"],
-            stands_for=arrays["stands_for"],
-            targets={name: target(name, value) for name, value in self.targets.items()},
+            rows=replace(self.rows, indptr=next(left), ids=next(left), weights=next(left)),
+            pixels=next(left),
+            stands_for=next(left),
+            targets={
+                name: Ragged(starts=next(left), values=next(left))
+                if isinstance(target, Ragged)
+                else next(left)
+                for name, target in self.targets.items()
+            },
         )
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes it holds, in memory or in files."""
-        return sum(tensor.nbytes for tensor in self.arrays().values())
 
 
 def _consecutive(rows: SparseWeights, begin: int, end: int) -> SparseWeights:
@@ -362,10 +323,8 @@ def _slice(target: Target, begin: int, end: int) -> Target:
     return target.slice(begin, end) if isinstance(target, Ragged) else target[begin:end]
 
 
-class RowStore:
-    """Keeps drawn views; those that would exceed the budget are memory-mapped NumPy files.
-
-    The files lie in a temporary folder that goes with the store.
+class TensorBudget:
+    """Keeps tensors in memory up to a budget, and others as mapped files of a temporary folder.
 
     Args:
         memory: Bytes that are kept in memory.
@@ -374,53 +333,39 @@ class RowStore:
     def __init__(self, memory: int) -> None:
         self._left = memory
         self._holder: tempfile.TemporaryDirectory[str] | None = None
-        self._views: list[DrawnView] = []
+        self._files = 0
 
-    def __len__(self) -> int:
-        return len(self._views)
-
-    def __getitem__(self, index: int) -> DrawnView:
-        return self._views[index]
-
-    def append(self, view: DrawnView) -> None:
-        """Keep a view.
+    def kept(self, tensors: Sequence[Tensor]) -> Sequence[Tensor]:
+        """The tensors, all in memory or all mapped.
 
         Raises:
-            SplatsegError: If it is too much for memory and cannot be written.
+            SplatsegError: If they are too much for memory and cannot be written.
         """
-        size = view.nbytes
+        size = sum(tensor.nbytes for tensor in tensors)
         if size <= self._left:
             self._left -= size
-            self._views.append(view)
-            return
-        self._views.append(self._on_disk(view))
+            return tensors
+        try:
+            if self._holder is None:
+                self._holder = tempfile.TemporaryDirectory(prefix="splatseg-training-")
+            return [self._mapped(Path(self._holder.name), tensor) for tensor in tensors]
+        except OSError as error:
+            raise SplatsegError(
+                f"{tempfile.gettempdir()}: what is beyond the memory budget cannot be written "
+                f"({error})."
+            ) from error
 
     def close(self) -> None:
-        """Forget all views and remove the files."""
-        self._views.clear()
+        """Remove the files."""
         if self._holder is not None:
             self._holder.cleanup()
             self._holder = None
 
-    def _on_disk(self, view: DrawnView) -> DrawnView:
-        try:
-            if self._holder is None:
-                self._holder = tempfile.TemporaryDirectory(prefix="splatseg-rows-")
-            folder = Path(self._holder.name) / f"{len(self._views):06d}"
-            folder.mkdir()
-            return view.with_arrays(
-                {name: _mapped(folder / f"{name}.npy", t) for name, t in view.arrays().items()}
-            )
-        except OSError as error:
-            raise SplatsegError(
-                f"{tempfile.gettempdir()}: rows beyond the memory budget cannot be written "
-                f"({error})."
-            ) from error
-
-
-def _mapped(path: Path, tensor: Tensor) -> Tensor:
-    np.save(path, tensor.numpy(), allow_pickle=False)
-    if not tensor.numel():  # an empty file cannot be mapped
-        return tensor
-    # Copy on write: torch wants arrays it may write to, and the file is to stay as it is.
-    return torch.from_numpy(read_npy(path, mapped=True))
+    def _mapped(self, folder: Path, tensor: Tensor) -> Tensor:
+        if not tensor.numel():  # an empty file cannot be mapped
+            return tensor
+        path = folder / f"{self._files:07d}.npy"
+        self._files += 1
+        np.save(path, tensor.numpy(), allow_pickle=False)
+        # Copy on write: torch wants arrays it may write to, and the file is to stay as it is.
+        return torch.from_numpy(read_npy(path, mapped=True))

@@ -80,19 +80,16 @@ class Values:
         differentiable: bool,
     ) -> None:
         self._row_values = row_values
-        self._shared = {
+        self.shared: dict[str, Tensor] = {
             name: value.detach().requires_grad_(differentiable) for name, value in shared.items()
         }
+        """Shared arrays, by name."""
         self._asked: list[tuple[str, Tensor, Tensor]] = []
         self._differentiable = differentiable
-        self._kept: dict[str, Tensor] = {}
+        self.kept: dict[str, Tensor] = {}
+        """What `keep` was given, by name."""
         self.rng = rng
         self.step = step
-
-    @property
-    def shared(self) -> Mapping[str, Tensor]:
-        """Shared arrays, by name."""
-        return self._shared
 
     def rows(self, name: str, index: Int64[Tensor, "t"]) -> Float[Tensor, "t channels"]:
         """Some rows of an array; `index` is distinct."""
@@ -107,13 +104,8 @@ class Values:
 
         `shared` has it at once, and the training from this step on.
         """
-        self._kept[name] = value.detach()
-        self._shared[name] = self._kept[name]
-
-    @property
-    def kept(self) -> Mapping[str, Tensor]:
-        """What `keep` was given, by name."""
-        return self._kept
+        self.kept[name] = value.detach()
+        self.shared[name] = self.kept[name]
 
     def render(self, name: str, batch: Batch) -> Float[Tensor, "pixels channels"]:
         """An array as a batch's pixels show it: ``W @ array``."""

@@ -30,7 +30,7 @@ from splatseg.core import (
 from splatseg.core.options import Count, options
 from splatseg.errors import InputError, ShapeError
 from splatseg.lift.voting.uplift import RenderAdjoint, voting_views
-from splatseg.render import RenderOptions, options_for
+from splatseg.render import options_for
 
 _CHANNELS = 64
 """Channels carried at a time, which bounds the memory of upsampled images."""
@@ -58,7 +58,6 @@ def uplift_features(
     evidence: FeatureSource,
     *,
     options: FeatureUpliftOptions | None = None,
-    render_options: RenderOptions | None = None,
     backend: str = "auto",
     progress: Callable[[int, int], None] | None = None,
 ) -> Features:
@@ -73,7 +72,6 @@ def uplift_features(
         evidence: Their feature maps: grids that cover the photograph, or the photograph reduced
             in proportion. A last row or column of cells may reach over the edge, or be missing.
         options: How features are normalised and read.
-        render_options: Switches of the blending model.
         backend: Name of the rendering backend.
         progress: Called with the views done and all there are.
 
@@ -89,7 +87,7 @@ def uplift_features(
     ordered = voting_views(views, evidence, "features")
     adjoint = RenderAdjoint(
         gaussians=gaussians,
-        options=render_options or options_for(gaussians, backend),
+        options=options_for(gaussians, backend),
         backend=backend,
     )
     values, weights = _weighted_sums(adjoint, ordered, evidence, options, progress)

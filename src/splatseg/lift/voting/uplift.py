@@ -219,7 +219,6 @@ def uplift(
     *,
     options: UpliftOptions | None = None,
     classes: ClassTable | None = None,
-    render_options: RenderOptions | None = None,
     backend: str = "auto",
     progress: Callable[[int, int], None] | None = None,
 ) -> Labels:
@@ -237,7 +236,6 @@ def uplift(
         evidence: Their label maps, as large as the photographs or reduced in proportion.
         options: How votes become labels.
         classes: Names of the ids, for the info.
-        render_options: Switches of the blending model.
         backend: Name of the rendering backend.
         progress: Called with the views done and all there are to do.
 
@@ -253,59 +251,24 @@ def uplift(
     """
     options = options or UpliftOptions()
     ordered = voting_views(views, evidence, "a label map")
-    votes = _collected(
-        gaussians,
-        ordered,
-        evidence,
-        options=options,
-        render_options=render_options or options_for(gaussians, backend),
-        backend=backend,
-        progress=progress,
-    )
-    return _labels(votes, ordered, options, names_of(classes, votes.label_mass.total))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Votes:
-    """Votes of all views."""
-
-    table: VoteTable
-    label_mass: LabelMass
-    visibility: Tensor
-    """(n,): how much of each Gaussian the views show."""
-
-    squared_visibility: Tensor
-    """(n,): the squares of what each view shows, summed."""
-
-    by_view: ViewVotes | None
-    """Only of soft layers."""
-
-
-def _collected(
-    gaussians: Gaussians,
-    ordered: Sequence[View],
-    evidence: LabelSource,
-    *,
-    options: UpliftOptions,
-    render_options: RenderOptions,
-    backend: str,
-    progress: Callable[[int, int], None] | None,
-) -> _Votes:
-    """Go through the views once and add up their votes."""
-    by_view = ViewVotes(gaussians.means) if options.candidates > 1 else None
+    soft = options.candidates > 1
+    by_view = ViewVotes(gaussians.means) if soft else None
     adjoint = RenderAdjoint(
-        gaussians=gaussians, options=render_options, backend=backend, by_view=by_view
+        gaussians=gaussians,
+        options=options_for(gaussians, backend),
+        backend=backend,
+        by_view=by_view,
     )
     slots = max(SLOTS, options.candidates)
     table = VoteTable(len(gaussians), memory=options.memory, slots=slots)
     label_mass = LabelMass()
-    visibility, squared_visibility = torch.zeros(len(gaussians)), torch.zeros(len(gaussians))
+    visibility, squares = torch.zeros(len(gaussians)), torch.zeros(len(gaussians))
     for done, view in enumerate(ordered):
         label_map = evidence.label_map(view.name)
         camera = camera_of_map(view, label_map.height, label_map.width)
         view_visibility = adjoint.add_view(table, label_mass, camera, label_map)
         visibility += view_visibility
-        squared_visibility += view_visibility**2
+        squares += view_visibility**2
         if by_view is not None:
             by_view.end_view(view.camera)
         if progress is not None:
@@ -314,20 +277,7 @@ def _collected(
         raise InputError(
             f"evidence: expected a labelled pixel in {len(ordered)} views, found none."
         )
-    return _Votes(
-        table=table,
-        label_mass=label_mass,
-        visibility=visibility,
-        squared_visibility=squared_visibility,
-        by_view=by_view,
-    )
-
-
-def _labels(
-    votes: _Votes, ordered: Sequence[View], options: UpliftOptions, names: dict[int, str]
-) -> Labels:
-    """The layer that the votes decide."""
-    ranking = votes.table.rank(options.candidates)
+    ranking = table.rank(options.candidates)
     decision = decide(
         ranking,
         rule=options.label_rule,
@@ -335,9 +285,7 @@ def _labels(
         min_weight=options.min_weight,
         min_share=options.min_share,
     )
-    background, record = _background(votes.label_mass)
-    soft = options.candidates > 1
-    squares = votes.squared_visibility
+    background, record = _background(label_mass)
     return Labels(
         ids=decision.ids,
         confidence=decision.confidence,
@@ -346,13 +294,13 @@ def _labels(
         shares=decision.shares if soft else None,
         evidence=ranking.total,
         # Kish's effective sample size: a view that shows hardly anything counts hardly anything.
-        effective_views=torch.where(squares > 0, votes.visibility**2 / squares, 0.0),
+        effective_views=torch.where(squares > 0, visibility**2 / squares, 0.0),
         info=LayerInfo(
             method="uplift",
             options=asdict(options),
             views=tuple(view.name for view in ordered),
-            names=names,
-            view_correlation=_correlation(votes.by_view, ranking),
+            names=names_of(classes, label_mass.total),
+            view_correlation=_correlation(by_view, ranking),
             details={
                 "background_votes": record,
                 "largest_error_bound": _largest_share(ranking.error_bound, ranking.total),

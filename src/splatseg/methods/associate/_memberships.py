@@ -73,21 +73,17 @@ class MembershipProblem:
         shown = sparse_product(rows, entries_of(may), start.shape[1])
         self._shown = entries_of(shown)[:2]
         self._start = start
-        self._light = np.asarray(rows.sum(axis=1), dtype=np.float64).ravel()
+        self.light: NDArray[np.float64] = np.asarray(rows.sum(axis=1), dtype=np.float64).ravel()
+        """(pixels,): the sum of each row."""
         self._native = _native.Memberships(
             *entries_of(rows), *entries_of(self._columns), *entries_of(start)[:2], *self._shown
         )
         self._residuals = np.zeros(len(self._shown[1]), np.float32)
         self.values = start.data.astype(np.float32)
 
-    @property
-    def light(self) -> NDArray[np.float64]:
-        """(pixels,): the sum of each row."""
-        return self._light
-
     def run(self, kept: NDArray[np.bool_], steps: int) -> None:
         """Some steps, in which only the pixels that are kept have a say."""
-        seen = np.asarray(self._columns @ np.where(kept, self._light, 0.0)).ravel()
+        seen = np.asarray(self._columns @ np.where(kept, self.light, 0.0)).ravel()
         step = (_RELAXATION / np.maximum(seen, _MIN_SEEN)).astype(np.float32)
         label = np.where(kept, self.label, -1).astype(np.int32)
         for _ in range(steps):

@@ -4,29 +4,29 @@ Our own say in the header of safetensors, as text, what they are.
 """
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal, TypeVar, cast, get_args
+from typing import Any, Literal, TypeVar, cast
 
 import torch
 from torch import Tensor, nn
 
 from splatseg.core import JSON
 from splatseg.core.boundary import boundary
-from splatseg.core.json_values import is_json_number, plain_object
+from splatseg.core.json_values import plain_object
 from splatseg.errors import FileFormatError, InputError, MissingFileError, quoted
-from splatseg.io.foreign import is_file, made_from
+from splatseg.io.foreign import is_file
 from splatseg.io.json_files import json_text, parse_object
+from splatseg.io.schema import structured
 from splatseg.io.tensor_table import COUNTER, TensorTable, with_state
 from splatseg.io.tensors import read_safetensors, read_tensors, read_torch_file, write_tensors
 from splatseg.methods.cosseg.foreign import foreign_encoder, layout_of
 from splatseg.methods.cosseg.network import RandlaEncoder, RandlaNet
-from splatseg.methods.cosseg.pyramid import PointInputs, RandlaConfig, RandlaVariant
+from splatseg.methods.cosseg.pyramid import PointInputs, RandlaConfig
 
 Part = Literal["encoder", "network"]
 FORMAT = "splatseg.point_network"
 VERSION = "1"
-T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,7 +42,7 @@ class About:
     inputs: PointInputs
     """How it is fed."""
 
-    recipe: Mapping[str, JSON]
+    recipe: dict[str, Any]
     """How it was trained, in words and numbers of whoever trained it."""
 
     def metadata(self) -> dict[str, str]:
@@ -70,36 +70,7 @@ def parse_about(metadata: Mapping[str, str], path: Path) -> About | None:
             f"got {quoted(metadata.get('version'))}; a newer splatseg may read it."
         )
     where = f"{path}: about"
-    content = parse_object(metadata.get("about", ""), where=where)
-    part, config, recipe = (content.get(key) for key in ("part", "config", "recipe"))
-    if part not in get_args(Part):
-        raise FileFormatError(f"{where}: expected encoder or network, got {quoted(part)}.")
-    if not isinstance(config, dict) or not isinstance(recipe, dict):
-        raise FileFormatError(f"{where}: expected objects config and recipe, got none.")
-    shape = cast("dict[str, Any]", config)
-    shape |= {"variant": _made(RandlaVariant, shape.get("variant"), f"{where}: variant")}
-    return About(
-        part=cast("Part", part),
-        config=_made(RandlaConfig, shape, f"{where}: config"),
-        inputs=_made(PointInputs, content.get("inputs"), f"{where}: inputs"),
-        recipe=cast("dict[str, JSON]", recipe),
-    )
-
-
-def _made(kind: type[T], value: object, where: str) -> T:
-    """A value of a dataclass from its fields in JSON."""
-    names = {one.name for one in fields(cast(Any, kind))}
-    if not isinstance(value, dict) or set(cast("dict[str, Any]", value)) != names:
-        raise FileFormatError(f"{where}: expected {', '.join(sorted(names))}, got {quoted(value)}.")
-    given = cast("dict[str, Any]", value)
-    for name, one in given.items():
-        for number in cast("list[object]", one) if isinstance(one, list) else [one]:
-            if isinstance(number, int | float) and not is_json_number(number):
-                raise FileFormatError(
-                    f"{where}: {name}: expected finite numbers, got {quoted(number)}."
-                )
-    with made_from(where):
-        return kind(**given)
+    return structured(parse_object(metadata.get("about", ""), where=where), About, where=where)
 
 
 SHIPPED = Path(__file__).parent / "weights" / "randla.safetensors"
@@ -336,5 +307,5 @@ def _halved(name: str, tensor: Tensor) -> Tensor:
 def _metadata(
     part: Part, config: RandlaConfig, inputs: PointInputs, facts: Mapping[str, Any]
 ) -> dict[str, str]:
-    recipe = plain_object("facts", facts)
-    return About(part=part, config=config, inputs=inputs, recipe=recipe).metadata()
+    about = About(part=part, config=config, inputs=inputs, recipe=plain_object("facts", facts))
+    return about.metadata()

@@ -272,10 +272,11 @@ class FusionModel:
         options: CossegOptions,
         rng: np.random.Generator,
     ) -> None:
-        self._shared = {
+        self.shared_parameters: Mapping[str, Parameter] = {
             name: Parameter(start=one, rate=0.0 if name.endswith(RUNNING) else options.rate)
             for name, one in first_weights(shape, classes, rng).items()
         }
+        """The decoder's and the classifier's weights."""
         self._classes = classes
         self._points, self._scored_points = points, scored_points
         self._options = options
@@ -284,11 +285,6 @@ class FusionModel:
     def row_parameters(self) -> Mapping[str, Parameter]:
         """None."""
         return {}
-
-    @property
-    def shared_parameters(self) -> Mapping[str, Parameter]:
-        """The decoder's and the classifier's weights."""
-        return self._shared
 
     def loss(self, batch: Batch, values: Values) -> Float[Tensor, ""]:
         """Of what the pixels show, over the log of the number of ids."""

@@ -80,7 +80,8 @@ class ReducedBlocks:
     ) -> None:
         self._source = source
         first = source.deep_features(views[0])
-        self._names = tuple(first.depths)
+        self.names: tuple[str, ...] = tuple(first.depths)
+        """Names of the blocks, the shallowest first."""
         self._token = first.class_token is not None
         self._channels = tuple(grid.channels for grid in first.maps)
         self._components = components
@@ -90,11 +91,6 @@ class ReducedBlocks:
     def view_names(self) -> Sequence[str]:
         """Views that have features."""
         return self._source.view_names
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the blocks, the shallowest first."""
-        return self._names
 
     @property
     def columns(self) -> tuple[slice, ...]:
@@ -138,9 +134,9 @@ class ReducedBlocks:
 
     def _checked(self, name: str) -> DeepFeatures:
         found = self._source.deep_features(name)
-        if tuple(found.depths) != self._names:
+        if tuple(found.depths) != self.names:
             raise InputError(
-                f"evidence: expected the blocks {', '.join(self._names)} of view {name}, got "
+                f"evidence: expected the blocks {', '.join(self.names)} of view {name}, got "
                 f"{', '.join(found.depths)}."
             )
         if (found.class_token is not None) != self._token:
@@ -242,7 +238,6 @@ def distilled_features(
     source: BlockSource,
     *,
     pixels: Int64[Tensor, "n"] | None = None,
-    render_options: RenderOptions | None = None,
     backend: str = "auto",
     progress: Callable[[int, int], None] | None = None,
 ) -> DistilledFeatures:
@@ -253,7 +248,6 @@ def distilled_features(
         views: Those whose features are used.
         source: Their features.
         pixels: What sums are divided by, of `pixel_counts`; None divides by blending weights.
-        render_options: Switches of the blending model.
         backend: Name of the rendering backend.
         progress: Called with the views done and all there are.
 
@@ -268,7 +262,6 @@ def distilled_features(
         ordered,
         reduced,
         options=FeatureUpliftOptions(longest_side=LIFTED_SIDE),
-        render_options=render_options,
         backend=backend,
         progress=progress,
     )
@@ -292,12 +285,11 @@ def pixel_counts(
     gaussians: Gaussians,
     views: Sequence[View],
     *,
-    render_options: RenderOptions | None = None,
     backend: str = "auto",
 ) -> Int64[Tensor, "n"]:
     """In how many pixels of all views each Gaussian takes part: the counter of eq. 2."""
     found = torch.zeros(len(gaussians), dtype=torch.int64)
-    options = render_options or options_for(gaussians, backend)
+    options = options_for(gaussians, backend)
     for view in views:
         found += view_pixel_counts(gaussians, view, options, backend)
     return found

@@ -265,9 +265,7 @@ def train_cosseg_jointly(
         seed=context.seed,
         progress=progress,
     )
-    shown = pixel_counts(
-        learnt, data.views, render_options=context.render_options, backend=context.backend
-    )
+    shown = pixel_counts(learnt, data.views, backend=context.backend)
     result = TrainingResult(
         rows={},
         shared={name: one.detach() for name, one in loss.weights.items()},

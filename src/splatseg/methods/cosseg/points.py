@@ -5,10 +5,8 @@ encoded at once, as CoSSegGaussians does with what a view sees. The encoder take
 reads coordinates: the origin and the scale are those of the scene, for all of its subsets.
 """
 
-import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -18,14 +16,13 @@ from torch import Tensor
 from splatseg.core import Gaussians
 from splatseg.core.rigid import upright
 from splatseg.core.sh import base_colours
-from splatseg.errors import InputError, RangeError, SplatsegError
-from splatseg.io.arrays import read_npy
+from splatseg.errors import InputError, RangeError
+from splatseg.lift.training import TensorBudget
 from splatseg.methods.cosseg.checkpoint import PointEncoder
 from splatseg.methods.cosseg.options import Spatial
 from splatseg.methods.cosseg.pyramid import (
     MAX_METRES,
     PointPyramid,
-    PyramidOptions,
     feed_points,
     point_pyramid,
     points_origin,
@@ -112,9 +109,7 @@ def spatial_features(
     metres = _in_metres(positions.detach().cpu().double(), frame.metres_per_unit)
     given = colours if encoder.colour else None
     local, channels = feed_points(metres, given, inputs=encoder.inputs, origin=frame.origin)
-    config = encoder.config
-    shape = PyramidOptions(neighbours=config.neighbours, ratios=config.ratios)
-    pyramid = point_pyramid(local, options=shape, seed=seed)
+    pyramid = point_pyramid(local, options=encoder.config, seed=seed)
     with torch.no_grad():
         levels = encoder.encoder(pyramid, channels)
     return pyramid, tuple(_halved(level) for level in levels)
@@ -288,18 +283,15 @@ class VisiblePoints:
 
     def __init__(self, make: Callable[[int], PointSet], *, memory: int) -> None:
         self._make = make
-        self._left = memory
+        self._budget = TensorBudget(memory)
         self._kept: dict[int, PointSet] = {}
-        self._holder: tempfile.TemporaryDirectory[str] | None = None
 
     def __enter__(self) -> "VisiblePoints":
         return self
 
     def __exit__(self, *_: object) -> None:
         self._kept.clear()
-        if self._holder is not None:
-            self._holder.cleanup()
-            self._holder = None
+        self._budget.close()
 
     def of(self, view: int) -> PointSet:
         """The points of a view.
@@ -307,44 +299,15 @@ class VisiblePoints:
         Raises:
             SplatsegError: If they are too much for memory and cannot be written.
         """
-        found = self._kept.get(view)
-        if found is None:
-            found = self._make(view)
-            size = sum(one.nbytes for one in _arrays(found))
-            if size <= self._left:
-                self._left -= size
-            else:
-                found = self._on_disk(view, found)
-            self._kept[view] = found
-        return found
+        if view not in self._kept:
+            self._kept[view] = self._budgeted(self._make(view))
+        return self._kept[view]
 
-    def _on_disk(self, view: int, points: PointSet) -> PointSet:
-        try:
-            if self._holder is None:
-                self._holder = tempfile.TemporaryDirectory(prefix="splatseg-points-")
-            folder = Path(self._holder.name)
-            arrays = [
-                _mapped(folder / f"{view:06d}-{index}.npy", one)
-                for index, one in enumerate(_arrays(points))
-            ]
-        except OSError as error:
-            raise SplatsegError(
-                f"points of views beyond the memory budget cannot be written ({error})."
-            ) from error
-        count = len(points.inputs.levels)
+    def _budgeted(self, points: PointSet) -> PointSet:
+        inputs = points.inputs
+        arrays = self._budget.kept((*inputs.levels, *inputs.up, points.rows))
+        count = len(inputs.levels)
         return PointSet(
             inputs=FusionInputs(levels=tuple(arrays[:count]), up=tuple(arrays[count:-1])),
             rows=arrays[-1],
         )
-
-
-def _arrays(points: PointSet) -> Sequence[Tensor]:
-    return (*points.inputs.levels, *points.inputs.up, points.rows)
-
-
-def _mapped(path: Path, values: Tensor | Int64[Tensor, "n"]) -> Tensor:
-    np.save(path, values.numpy(), allow_pickle=False)
-    if not values.numel():  # an empty file cannot be mapped
-        return values
-    # Copy on write: torch wants arrays it may write to, and the file is to stay as it is.
-    return torch.from_numpy(read_npy(path, mapped=True))

@@ -80,7 +80,22 @@ class RandlaVariant:
 
 
 @options
-class RandlaConfig:
+class PyramidOptions:
+    """How points are sampled. The defaults are RandLA-Net's for S3DIS."""
+
+    neighbours: Width = 16
+    """Points that a point sees in its level, itself included."""
+
+    ratios: tuple[Width, ...] = (4, 4, 4, 4, 2)
+    """Of how many points of a level one is kept in the next, one number a level."""
+
+    def __post_init__(self) -> None:
+        if not self.ratios:
+            raise RangeError("ratios: expected at least one level, got none.")
+
+
+@options
+class RandlaConfig(PyramidOptions):
     """The shape of a RandLA-Net. The defaults are the published ones for S3DIS.
 
     Example:
@@ -98,12 +113,6 @@ class RandlaConfig:
 
     widths: tuple[Width, ...] = (16, 64, 128, 256, 512)
     """d of each level's block, even; a block gives 2 d channels."""
-
-    neighbours: Width = 16
-    """Points that a point sees in its level, itself included."""
-
-    ratios: tuple[Width, ...] = (4, 4, 4, 4, 2)
-    """Of how many points of a level one is kept in the next, one number a level."""
 
     classes: Width = 13
     """Classes of the network's own head; an encoder has none."""
@@ -233,21 +242,6 @@ def _checked(positions: Tensor) -> NDArray[np.float64]:
     if not len(positions):
         raise RangeError("positions: expected at least one point, got none.")
     return positions.detach().cpu().double().numpy()
-
-
-@options
-class PyramidOptions:
-    """How points are sampled. The defaults are RandLA-Net's for S3DIS."""
-
-    neighbours: Width = 16
-    """Points that a point sees in its level, itself included."""
-
-    ratios: tuple[Width, ...] = (4, 4, 4, 4, 2)
-    """Of how many points of a level one is kept in the next, one number a level."""
-
-    def __post_init__(self) -> None:
-        if not self.ratios:
-            raise RangeError("ratios: expected at least one level, got none.")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

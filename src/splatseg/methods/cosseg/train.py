@@ -117,12 +117,8 @@ def prepare(
     if features is None and options.spatial == "none":
         raise InputError("features: expected evidence of features to decode, got none.")
     chosen, counts = torch.arange(len(gaussians)), None
-    rendering: dict[str, Any] = {
-        "render_options": context.render_options,
-        "backend": context.backend,
-    }
     if options.is_published:
-        counts = pixel_counts(gaussians, data.views, **rendering)
+        counts = pixel_counts(gaussians, data.views, backend=context.backend)
         chosen = torch.nonzero(counts >= options.min_pixels).squeeze(1)
         if not len(chosen):
             raise InputError(
@@ -131,7 +127,9 @@ def prepare(
             )
     distilled = None
     if features is not None and options.semantic != "none":
-        distilled = distilled_features(gaussians, data.views, features, pixels=counts, **rendering)
+        distilled = distilled_features(
+            gaussians, data.views, features, pixels=counts, backend=context.backend
+        )
     encoder = frame = None
     if options.spatial != "none":
         encoder = load_point_encoder(options.encoder)
@@ -257,7 +255,7 @@ def _points(
         yield (lambda _: everything), (lambda _: everything)
         return
     gaussians = prepared.source.gaussians
-    blending = context.render_options or options_for(gaussians, context.backend)
+    blending = options_for(gaussians, context.backend)
     is_chosen = everything.rows >= 0
 
     def make(views: Sequence[View], index: int) -> PointSet:

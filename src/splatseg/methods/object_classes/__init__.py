@@ -64,7 +64,7 @@ from splatseg.methods.object_classes.classify import (
     pool_objects,
     with_categories,
 )
-from splatseg.render import RenderOptions
+from splatseg.render import RenderOptions as RenderOptions
 
 MAX_CORRELATION = 1 / 3
 """Correlation of neighbouring views from which on own votes have no share, unless objects are
@@ -191,7 +191,6 @@ def label_objects(
     options: ObjectLabelOptions,
     classes: ClassTable | None = None,
     categories: Mapping[int, Mapping[int, float]] | None = None,
-    render_options: RenderOptions | None = None,
     backend: str = "auto",
     progress: Callable[[int, int], None] | None = None,
 ) -> ObjectLabels:
@@ -206,7 +205,6 @@ def label_objects(
         options: How features are lifted, and votes and features weighed.
         classes: Names of the classes.
         categories: Of tracks, how much speaks for which class. None: labels are classes.
-        render_options: Switches of the blending model.
         backend: Name of the rendering backend.
         progress: Called with the stages done and all there are.
 
@@ -226,7 +224,6 @@ def label_objects(
         evidence,
         options=UpliftOptions(candidates=CANDIDATES),
         classes=classes,
-        render_options=render_options,
         backend=backend,
     )
     tell(1)
@@ -241,7 +238,6 @@ def label_objects(
             gaussians,
             views,
             features,
-            render_options=render_options,
             backend=backend,
         )
         scales = distilled.scales[-1:]

@@ -12,9 +12,6 @@ References:
 from dataclasses import asdict
 from typing import cast
 
-from jaxtyping import Bool
-from torch import Tensor
-
 from splatseg.core import JSON, PromptableMasks, Selection
 from splatseg.core.layer_info import LayerInfo
 from splatseg.core.models import GroundedMasks, TextFeatures
@@ -28,7 +25,6 @@ from splatseg.methods.prompt.session import PromptedObject as PromptedObject
 from splatseg.methods.prompt.session import PromptSession as PromptSession
 from splatseg.methods.prompt.session import PromptSources as PromptSources
 from splatseg.methods.prompt.views import initial_views as initial_views
-from splatseg.methods.prompt.views import points_inside
 from splatseg.methods.prompt.words import FoundObject as FoundObject
 
 
@@ -50,18 +46,6 @@ def parsed_points(texts: tuple[str, ...]) -> list[tuple[str, float, float]]:
         if not name:
             raise InputError(f"point: expected VIEW:X,Y, such as front:200,150, got {text!r}.")
     return found
-
-
-def mask_points(view: str, mask: Bool[Tensor, "height width"], count: int = 8) -> tuple[str, ...]:
-    """Points of a mask, as the option ``point`` takes them.
-
-    Args:
-        view: Name of its view.
-        mask: The mask.
-        count: How many, far from its rim and from each other.
-    """
-    points = points_inside(mask, count).tolist()
-    return tuple(f"{view}:{x:g},{y:g}" for x, y in points)
 
 
 def selection_of(prompted: Prompted, session: PromptSession, options: PromptOptions) -> Selection:

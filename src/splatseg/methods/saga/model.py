@@ -249,25 +249,21 @@ class SagaModel:
         self._options = options
         self._unit = not options.is_published
         self._guided = guidance > 0 and options.guidance_weight > 0
-        self._rows = {"features": Parameter(start=features, rate=options.rate)}
-        self._shared: dict[str, Parameter] = {}
+        self.row_parameters: Mapping[str, Parameter] = {
+            "features": Parameter(start=features, rate=options.rate)
+        }
+        """``features``."""
+        self.shared_parameters: dict[str, Parameter] = {}
+        """``gate_weight`` and ``gate_bias`` where there is a gate, and the projector's arrays."""
         if options.gated:
             weight, bias = gate_start(features.shape[1])
             for name, start in (("gate_weight", weight), ("gate_bias", bias)):
-                self._shared[name] = Parameter(start=start, rate=_GATE_RATE)
+                self.shared_parameters[name] = Parameter(start=start, rate=_GATE_RATE)
         if self._guided:
             for name, start in projector_start(guidance, features.shape[1], rng).items():
-                self._shared[PROJECTOR + name] = Parameter(start=start, rate=PUBLISHED_RATE)
-
-    @property
-    def row_parameters(self) -> Mapping[str, Parameter]:
-        """``features``."""
-        return self._rows
-
-    @property
-    def shared_parameters(self) -> Mapping[str, Parameter]:
-        """``gate_weight`` and ``gate_bias`` where there is a gate, and the projector's arrays."""
-        return self._shared
+                self.shared_parameters[PROJECTOR + name] = Parameter(
+                    start=start, rate=PUBLISHED_RATE
+                )
 
     def loss(self, batch: Batch, values: Values) -> Float[Tensor, ""]:
         """The sum of the chosen losses, the mean over the views of the batch."""
@@ -277,7 +273,8 @@ class SagaModel:
             scales = [0.0, *sorted(values.rng.random(_SCALES).tolist()), 1.0]
         weight = self._options.guidance_weight
         losses, prototypes = [], []
-        for pixels, inside, numbers in _by_view(batch):
+        for _, pixels, row, mask in _entries_by_view(batch):
+            inside, numbers = members(row, mask, len(pixels))
             seen = rendered[pixels]
             losses.append(self._pair_loss(seen, inside, numbers, scales, values))
             if weight > 0 and len(numbers):
@@ -361,7 +358,7 @@ class SagaModel:
 
     def _sparsity(self, prototypes: Sequence[Tensor], values: Values) -> Float[Tensor, ""]:
         """The mean positive product of queries with some Gaussians, wherever they are."""
-        count = len(self._rows["features"].start)
+        count = len(self.row_parameters["features"].start)
         some = max(1, round(_SPARSITY_SHARE * count))
         drawn = np.sort(values.rng.choice(count, some, replace=False))
         features = values.rows("features", torch.from_numpy(drawn))
@@ -374,13 +371,8 @@ class SagaModel:
         parts: dict[int, list[tuple[Tensor, Tensor, Tensor, Tensor]]] = {}
         for batch in batches:
             rendered = self._rendered(batch, values)
-            masks = batch.ragged_target("masks")
-            row = torch.repeat_interleave(torch.arange(len(batch)), torch.diff(masks.starts))
-            for view in torch.unique(batch.views).tolist():
-                pixels = torch.nonzero(batch.views == view).squeeze(1)
-                mine = batch.views[row] == view
-                local = torch.searchsorted(pixels, row[mine])
-                part = (rendered[pixels], local, masks.values[mine], batch.stands_for[pixels])
+            for view, pixels, local, mask in _entries_by_view(batch):
+                part = (rendered[pixels], local, mask, batch.stands_for[pixels])
                 parts.setdefault(view, []).append(part)
         for view in sorted(parts):
             found = parts[view]
@@ -408,14 +400,15 @@ def gate_start(channels: int) -> tuple[Float[Tensor, "channels"], Float[Tensor, 
     return torch.full((channels,), -_STEEPNESS), _STEEPNESS * ends
 
 
-def _by_view(
-    batch: Batch,
-) -> Iterator[tuple[Int64[Tensor, "some"], Bool[Tensor, "some masks"], Int64[Tensor, "masks"]]]:
-    """The pixels of each view of a batch, which masks contain them, and these masks' numbers."""
+def _entries_by_view(batch: Batch) -> Iterator[tuple[int, Tensor, Tensor, Tensor]]:
+    """Each view of a batch, its pixels, and the masks that contain them.
+
+    The latter as pairs: the place among these pixels, and the number of the mask.
+    """
     masks = batch.ragged_target("masks")
     row = torch.repeat_interleave(torch.arange(len(batch)), torch.diff(masks.starts))
     for view in torch.unique(batch.views).tolist():
         pixels = torch.nonzero(batch.views == view).squeeze(1)
         mine = batch.views[row] == view
         local = torch.searchsorted(pixels, row[mine])
-        yield pixels, *members(local, masks.values[mine], len(pixels))
+        yield view, pixels, local, masks.values[mine]

@@ -10,8 +10,6 @@ from jaxtyping import Int64
 from torch import Tensor
 
 from splatseg.core import (
-    LEARNED_BYTES,
-    LOSS_CURVE,
     Features,
     FeatureSource,
     Gaussians,
@@ -36,7 +34,7 @@ from splatseg.lift.training import (
 )
 from splatseg.lift.voting.features import read_features_at
 from splatseg.lift.voting.uplift import voting_views
-from splatseg.methods._trained import TrainingContext, loss_curve
+from splatseg.methods._trained import TrainingContext, training_details
 from splatseg.methods.associate import associate_masks
 from splatseg.methods.saga.masks import (
     GROUP_SCALE,
@@ -123,7 +121,8 @@ class SagaTargets:
                     )
                 digest.update(repr((view.name, found.stride, found.height, found.width)).encode())
                 digest.update(found.features.float().cpu().numpy().tobytes())
-        self._fingerprint = digest.hexdigest()
+        self.fingerprint: str = digest.hexdigest()
+        """A digest of all masks and features."""
 
     @property
     def channels(self) -> int:
@@ -134,11 +133,6 @@ class SagaTargets:
     def view_names(self) -> Sequence[str]:
         """The views to learn from."""
         return self._masks.view_names
-
-    @property
-    def fingerprint(self) -> str:
-        """A digest of all masks and features."""
-        return self._fingerprint
 
     def choice(self, name: str) -> PixelChoice:
         """All pixels, or all cells of the grid."""
@@ -242,7 +236,6 @@ def train_saga(
         ordered,
         source,
         options=options.drawing(),
-        render_options=context.render_options,
         backend=context.backend,
     )
     model = SagaModel(
@@ -323,12 +316,6 @@ def _info(
         details={
             "published": options.is_published,
             "trained": options.trained(len(result.losses)),
-            LOSS_CURVE: loss_curve(result.losses),
-            "loss": float(np.mean(result.losses[-20:])),
-            "steps": len(result.losses),
-            "best_step": result.best_step,
-            "stopped": result.stopped,
-            "scores": [[step, score] for step, score in result.scores],
-            LEARNED_BYTES: result.learned_bytes,
+            **training_details(result),
         },
     )

@@ -195,8 +195,10 @@ class TableWords:
         last_layers: LastLayers | None = None,
     ) -> None:
         check_shape("weights", weights, (len(table),))
-        self._weights = weights.detach().cpu().float()
-        self._vocabulary = vocabulary
+        self.weights = weights.detach().cpu().float()
+        """What the feature of each row rests on."""
+        self.vocabulary: Vocabulary = vocabulary
+        """Words that can be asked for."""
         if last_layers is not None:
             table = _applied(table, last_layers)
         space = vocabulary.space
@@ -221,19 +223,9 @@ class TableWords:
         return len(self._table)
 
     @property
-    def vocabulary(self) -> Vocabulary:
-        """Words that can be asked for."""
-        return self._vocabulary
-
-    @property
     def span(self) -> WordSpan | None:
         """Where words are compared; None is the whole space."""
         return self._span
-
-    @property
-    def weights(self) -> Float[Tensor, "m"]:
-        """What the feature of each row rests on."""
-        return self._weights
 
     @boundary
     def cosines(
@@ -253,7 +245,7 @@ class TableWords:
                 kept = energy / (energy.square() + min_energy**2).sqrt().clamp_min(_TINY)
                 scaled = torch.nn.functional.normalize(inside, dim=1) * kept[:, None]
             return products(self._inside, scaled)
-        space = self._vocabulary.space
+        space = self.vocabulary.space
         if space.basis is None or space.mean is None:
             found = products(self._table, words)
         else:
@@ -272,9 +264,9 @@ class TableWords:
         Raises:
             InputError: If there are no words, or nothing is known of one.
         """
-        asked = self._vocabulary.vectors(words)
-        others = context_of(self._vocabulary)
-        rivals = self._vocabulary.vectors(others) if others else asked[:0]
+        asked = self.vocabulary.vectors(words)
+        others = context_of(self.vocabulary)
+        rivals = self.vocabulary.vectors(others) if others else asked[:0]
         cosines = self.cosines(asked)
         against, largest = self._against(rivals)
         with one_torch_thread():
@@ -301,11 +293,11 @@ class TableWords:
         count = min(_SPAN_ROWS, len(known))
         # In whole numbers: rounding down what a processor rounded would choose others on another.
         chosen = known[torch.arange(count) * (len(known) - 1) // max(count - 1, 1)]
-        weights = self._weights[chosen]
+        weights = self.weights[chosen]
         return word_span(
             self._table.decode(chosen),
             torch.where(weights > 0, weights, _TINY),
-            self._vocabulary.space,
+            self.vocabulary.space,
             components=components,
         )
 

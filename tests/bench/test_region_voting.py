@@ -5,8 +5,8 @@ import torch
 
 from lift.test_point_labels import gaussians_at
 from splatseg.errors import RangeError, ShapeError
-from splatseg.lift import point_regions
-from splatseg.lift.point_regions import region_labels
+from splatseg_bench import region_voting
+from splatseg_bench.region_voting import region_labels
 
 HERE = torch.zeros(1, 3)
 
@@ -49,7 +49,7 @@ def test_it_is_the_loop(rng, monkeypatch) -> None:
                 votes[id] += float(weight)
         best = max(votes, key=lambda id: (votes[id], -id))
         expected.append(best if votes[best] > 0 else -1)
-    monkeypatch.setattr(point_regions, "_POINTS", 7)
+    monkeypatch.setattr(region_voting, "_POINTS", 7)
     found = region_labels(scene, ids, points, weights=weights)
     assert found.ids.tolist() == expected
     assert -1 in expected
