@@ -33,8 +33,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from splatseg.lift.relevancy import TextSpace
-from splatseg.lift.voxels import TableWords, store
 from torch import Tensor, nn
 from word_scene import WordScene
 
