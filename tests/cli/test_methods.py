@@ -95,7 +95,7 @@ def test_help_shows_the_flags_of_one_method_only(splatseg) -> None:
     assert status == 0
     assert "--occlusion" in text
     assert "--evidence" in text
-    assert "--completion.neighbours" in text
+    assert "--complete" in text
     for foreign in ("--label-rule", "--agreement", "--identity"):
         assert foreign not in text
     assert "SA-GS" in text

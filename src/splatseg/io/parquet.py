@@ -10,7 +10,6 @@ is in parquet.thrift of the format's own pages:
     ColumnMetaData.3 path_in_schema, .5 num_values, .6 total_uncompressed_size
 """
 
-import importlib
 import struct
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -189,8 +188,9 @@ class RowWriter:
 
 
 def _arrow(path: Path) -> Any:
+    arrow = import_package("pyarrow", f"{path}: Parquet", "waymo")
     import_package("pyarrow.parquet", f"{path}: Parquet", "waymo")
-    return importlib.import_module("pyarrow")
+    return arrow
 
 
 @contextmanager
