@@ -101,6 +101,13 @@ def test_help_shows_the_flags_of_one_method_only(splatseg) -> None:
     assert "SA-GS" in text
 
 
+def test_flags_of_completion_say_that_they_went(small, splatseg) -> None:
+    words = ("segment", small.scene, "--method", "vote", "--completion.neighbours", "3")
+    status, _, error = splatseg(*words)
+    assert status == 2
+    assert "--completion.neighbours: this option was removed; labels are completed in one" in error
+
+
 def test_help_without_a_method_lists_them_all(splatseg) -> None:
     status, text, _ = splatseg("segment", "--help")
     assert status == 0

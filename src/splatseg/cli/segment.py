@@ -5,7 +5,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, make_dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import tyro
 
@@ -53,6 +53,12 @@ _HIDDEN_CHECKPOINTS = (
 task, which says why."""
 
 
+_COMPLETION = (
+    "neighbours", "spread_steps", "own_evidence", "min_inferred", "colour_width", "feature_width",
+    "smoothing", "smoothing_steps", "completed_layer",
+)  # fmt: skip
+
+
 @dataclass(frozen=True, kw_only=True)
 class Command(OnScene):
     """Lift evidence of the photographs onto the Gaussians: it becomes a layer.
@@ -69,6 +75,11 @@ class Command(OnScene):
 
     splatseg segment room --method vote --evidence labels_tracked --views all --json
     """
+
+    REMOVED: ClassVar[dict[str, str]] = {
+        f"completion.{name}": "labels are completed in one way, or not at all (--no-complete)"
+        for name in _COMPLETION
+    }
 
     method: Annotated[str, tyro.conf.arg(metavar="METHOD")]
     """Method to use. `splatseg segment --method METHOD --help` shows its options."""
