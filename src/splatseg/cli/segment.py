@@ -80,6 +80,7 @@ class Command(OnScene):
         f"completion.{name}": "labels are completed in one way, or not at all (--no-complete)"
         for name in _COMPLETION
     }
+    """Flags that went, and what to do instead."""
 
     method: Annotated[str, tyro.conf.arg(metavar="METHOD")]
     """Method to use. `splatseg segment --method METHOD --help` shows its options."""
