@@ -21,6 +21,21 @@ from splatseg.core.scene import ClassTable
 from splatseg.errors import InputError, RangeError
 
 
+def signs_of_points(points: Tensor, positive: Tensor | None) -> Tensor:
+    """Whether each of the points (p, 2) is on the thing; all are where nothing is said.
+
+    Raises:
+        ShapeError: If points are not p x 2, or signs are not of p points.
+        RangeError: If a coordinate is not finite.
+    """
+    check_shape("points", points, (None, 2))
+    check_finite("points", points)
+    if positive is None:
+        return torch.ones(len(points), dtype=torch.bool)
+    check_shape("positive", positive, (len(points),))
+    return positive.to(torch.bool)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Prompt:
     """What a person points at in an image: points, a box, a rough mask, or several of them."""
@@ -39,14 +54,7 @@ class Prompt:
 
     def __post_init__(self) -> None:
         convert_fields(self)
-        check_shape("points", self.points, (None, 2))
-        check_finite("points", self.points)
-        count = len(self.points)
-        if self.positive is None:
-            object.__setattr__(self, "positive", torch.ones(count, dtype=torch.bool))
-        else:
-            check_shape("positive", self.positive, (count,))
-            object.__setattr__(self, "positive", self.positive.to(torch.bool))
+        object.__setattr__(self, "positive", signs_of_points(self.points, self.positive))
         if self.box is not None:
             check_shape("box", self.box, (4,))
             check_finite("box", self.box)

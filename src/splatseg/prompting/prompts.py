@@ -13,6 +13,7 @@ from torch import Tensor
 from splatseg._check import check_finite, check_shape
 from splatseg.core import Gaussians, Selection, View
 from splatseg.core.boundary import boundary, convert_fields
+from splatseg.core.models import signs_of_points
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.selection.where import box_corners, check_ball
 
@@ -51,13 +52,7 @@ class ViewPrompt:
 
     def __post_init__(self) -> None:
         convert_fields(self)
-        check_shape("points", self.points, (None, 2))
-        check_finite("points", self.points)
-        count = len(self.points)
-        if self.positive is None:
-            object.__setattr__(self, "positive", torch.ones(count, dtype=torch.bool))
-        else:
-            check_shape("positive", self.positive, (count,))
+        object.__setattr__(self, "positive", signs_of_points(self.points, self.positive))
         self._check_points()
         self._check_box()
         given = False
@@ -66,7 +61,7 @@ class ViewPrompt:
             if pixels is not None:
                 self._check_pixels(name, pixels)
                 given = True
-        if not (given or count or self.box is not None):
+        if not (given or len(self.points) or self.box is not None):
             raise InputError(
                 f"prompt: expected a point, a box, a mask or strokes in view {self.view.name}, "
                 "got none."
