@@ -128,7 +128,8 @@ def read_ply_header(path: Path) -> PlyHeader:
     lines, offset = _header_lines(path, head)
     orders: list[str] = []
     comments: list[str] = []
-    elements: list[PlyElement] = []
+    elements: dict[str, tuple[int, dict[str, PlyProperty]]] = {}
+    last: dict[str, PlyProperty] | None = None
     for line in lines[1:]:
         match line.split():
             case [] | ["obj_info", *_]:
@@ -138,16 +139,27 @@ def read_ply_header(path: Path) -> PlyHeader:
             case ["format", word, _] if word in _ORDERS:
                 orders.append(_ORDERS[word])
             case ["element", name, count] if count.isdecimal() and len(count) < 16:
-                if any(one.name == name for one in elements):
+                if name in elements:
                     raise FileFormatError(f"{path}: the PLY element {quoted(name)} stands twice.")
-                elements.append(PlyElement(name=name, count=int(count)))
-            case ["property", *words] if elements:
-                elements[-1] = _with_property(path, elements[-1], words, line)
+                elements[name] = int(count), (last := {})
+            case ["property", *words] if last is not None:
+                added = _property(path, words, line)
+                if added.name in last:
+                    raise FileFormatError(
+                        f"{path}: the PLY property {quoted(added.name)} stands twice."
+                    )
+                last[added.name] = added
             case _:
                 raise FileFormatError(f"{path}: cannot read the PLY header line {quoted(line)}.")
     expect(len(orders) == 1, path, f"one PLY line of the format, got {len(orders)}")
     return PlyHeader(
-        order=orders[0], elements=tuple(elements), offset=offset, comments=tuple(comments)
+        order=orders[0],
+        elements=tuple(
+            PlyElement(name=name, count=count, properties=tuple(properties.values()))
+            for name, (count, properties) in elements.items()
+        ),
+        offset=offset,
+        comments=tuple(comments),
     )
 
 
@@ -164,21 +176,16 @@ def _header_lines(path: Path, head: bytes) -> tuple[list[str], int]:
     raise FileFormatError(f"{path}: expected a PLY header that ends with 'end_header', got none.")
 
 
-def _with_property(path: Path, element: PlyElement, words: list[str], line: str) -> PlyElement:
+def _property(path: Path, words: list[str], line: str) -> PlyProperty:
     match words:
         case [kind, name] if kind in _TYPES:
-            added = PlyProperty(name=name, code=_TYPES[kind])
+            return PlyProperty(name=name, code=_TYPES[kind])
         case ["list", length, kind, name] if (
             kind in _TYPES and length in _TYPES and _TYPES[length][0] != "f"
         ):
-            added = PlyProperty(name=name, code=_TYPES[kind], count_code=_TYPES[length])
+            return PlyProperty(name=name, code=_TYPES[kind], count_code=_TYPES[length])
         case _:
             raise FileFormatError(f"{path}: cannot read the PLY header line {quoted(line)}.")
-    if any(one.name == added.name for one in element.properties):
-        raise FileFormatError(f"{path}: the PLY property {quoted(added.name)} stands twice.")
-    return PlyElement(
-        name=element.name, count=element.count, properties=(*element.properties, added)
-    )
 
 
 def ply_header(

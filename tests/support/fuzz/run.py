@@ -12,6 +12,9 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import torch
+
+from support.fuzz.targets import TARGETS
 from support.fuzz.worker import work
 
 _START = 30
@@ -91,6 +94,7 @@ def fuzz(
     waiting, done = list(formats), list[Outcome]()
     active: list[_Run] = []
     with tempfile.TemporaryDirectory(prefix="fuzz-") as holder:
+        _import_for(formats, Path(holder))
         while waiting or active:
             while waiting and len(active) < jobs:
                 run = _Run(waiting.pop(0), range(first, first + tries), seed, limits, Path(holder))
@@ -101,6 +105,15 @@ def fuzz(
                 done.append(run.outcome)
                 report(run.outcome)
     return sorted(done, key=lambda outcome: formats.index(outcome.format))
+
+
+def _import_for(formats: Sequence[str], folder: Path) -> None:
+    """Read each sound file once before forking: what that imports is imported once, not once a
+    process, which took most of the time of a short run."""
+    torch.set_num_threads(1)  # a pool of threads would not survive the fork
+    for name in formats:
+        with tempfile.TemporaryDirectory(dir=folder) as one:
+            TARGETS[name](Path(one)).read()
 
 
 class _Run:
