@@ -1,6 +1,7 @@
 """Subsets of an index: against the reference, by hand, and what is refused."""
 
 import math
+from functools import cache
 
 import pytest
 import torch
@@ -71,22 +72,27 @@ def test_connected(points: Tensor, share: float, seed: int, radius: float) -> No
     assert torch.equal(got, reference.connected(points, members, start, radius))
 
 
+@cache
+def expected(shape: str) -> tuple[Tensor, list[Tensor], float, Tensor, Tensor]:
+    """Of `test_some_thousands_of_points`: once for all instruction sets, the reference is slow."""
+    points, members, start = cloud(shape, 4000, 1), some(4000, 0.7, 2), some(4000, 0.005, 3)
+    distances = [reference.mean_distances(points, members, k) for k in (1, 32)]
+    radius = float(distances[0][members].quantile(0.9))
+    near = reference.near(points, members, radius)
+    return points, distances, radius, near, reference.connected(points, members, start, radius)
+
+
 @pytest.mark.usefixtures("every_isa")
 @pytest.mark.parametrize("shape", SHAPES)
 def test_some_thousands_of_points(shape: str) -> None:
     """Several levels of nodes, strays that look for their own neighbours, several threads."""
-    points = cloud(shape, 4000, 1)
-    members = some(4000, 0.7, 2)
-    subset = Subset(NeighbourIndex(points), members)
-    for k in (1, 32):
-        want = reference.mean_distances(points, members, k)
+    points, distances, radius, near, connected = expected(shape)
+    subset = Subset(NeighbourIndex(points), some(4000, 0.7, 2))
+    for k, want in zip((1, 32), distances, strict=True):
         got = subset.mean_distances(k).double()
         torch.testing.assert_close(got, want, rtol=1e-6, atol=0, equal_nan=True)
-    radius = float(subset.mean_distances(1)[members].quantile(0.9))
-    assert torch.equal(subset.near(radius), reference.near(points, members, radius))
-    start = some(4000, 0.005, 3)
-    want = reference.connected(points, members, start, radius)
-    assert torch.equal(subset.connected(start, radius), want)
+    assert torch.equal(subset.near(radius), near)
+    assert torch.equal(subset.connected(some(4000, 0.005, 3), radius), connected)
 
 
 def test_a_radius_is_decided_as_the_index_decides_it() -> None:

@@ -78,36 +78,28 @@ def test_other_domain_has_no_say(script):
     assert float(shares[1, : script.ROOMS].sum()) == 0
 
 
-@pytest.fixture
-def one_thread():
-    """As the script trains by default: torch adds gradients up by its threads in any order."""
-    with one_torch_thread():
-        yield
-
-
-@pytest.mark.bits
 @pytest.mark.parametrize("at", [3, 8])
-def test_what_was_interrupted_ends_the_same(
-    script, recipe, clouds, at, tmp_path, monkeypatch, one_thread
-):
-    """In the first part, and in the second, which begins at step 4 + 2."""
+def test_what_was_interrupted_ends_the_same(script, recipe, clouds, at, tmp_path, monkeypatch):
+    """In the first part, and in the second, which begins at step 4 + 2. One thread, as the script
+    trains by default: torch adds gradients up by its threads in any order."""
     monkeypatch.setattr(script, "CHECKPOINT_EVERY", 2)
     monkeypatch.setattr(script, "CALIBRATION", 2)
     (tmp_path / "a").mkdir()
     (tmp_path / "b").mkdir()
-    whole, _ = script.train(recipe, clouds, tmp_path / "a")
-    drawn = script.drawn
+    with one_torch_thread():
+        whole, _ = script.train(recipe, clouds, tmp_path / "a")
+        drawn = script.drawn
 
-    def stop(clouds, recipe, step):
-        if step == at:
-            raise KeyboardInterrupt
-        return drawn(clouds, recipe, step)
+        def stop(clouds, recipe, step):
+            if step == at:
+                raise KeyboardInterrupt
+            return drawn(clouds, recipe, step)
 
-    with monkeypatch.context() as patch:
-        patch.setattr(script, "drawn", stop)
-        with pytest.raises(KeyboardInterrupt):
-            script.train(recipe, clouds, tmp_path / "b")
-    resumed, _ = script.train(recipe, clouds, tmp_path / "b")
+        with monkeypatch.context() as patch:
+            patch.setattr(script, "drawn", stop)
+            with pytest.raises(KeyboardInterrupt):
+                script.train(recipe, clouds, tmp_path / "b")
+        resumed, _ = script.train(recipe, clouds, tmp_path / "b")
     for name, tensor in whole.state_dict().items():
         assert torch.equal(tensor, resumed.state_dict()[name]), name
     with pytest.raises(SystemExit, match="another recipe"):
