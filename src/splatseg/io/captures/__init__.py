@@ -17,7 +17,6 @@ from splatseg.io.captures import pose_tables as tables
 from splatseg.io.captures.points import Metadata as Metadata
 from splatseg.io.captures.points import finite_points, read_ply_points
 from splatseg.io.captures.points import read_metadata as read_metadata
-from splatseg.io.captures.waymo_tfrecord import ENDING
 from splatseg.io.images import find_images
 
 
@@ -63,7 +62,7 @@ LAYOUTS = (
     _Layout("scannet", tables.find_scannet, tables.read_scannet),
     _Layout("scannetpp", nerfstudio.find_scannetpp, nerfstudio.read_scannetpp),
     _Layout("kitti360", kitti360.find_kitti360, kitti360.read_kitti360),
-    _Layout("waymo", waymo.find_waymo, waymo.read_waymo, suffixes=(waymo.SUFFIX, ENDING)),
+    _Layout("waymo", waymo.find_waymo, waymo.read_waymo, suffixes=(waymo.SUFFIX, waymo.OLD_SUFFIX)),
 )
 """Layouts that are read, in the order in which they are looked for."""
 
