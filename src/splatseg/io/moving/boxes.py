@@ -58,8 +58,6 @@ FOLDER = "data_3d_bboxes"
 _SPLITS = ("train_full", "train")
 _SUFFIX = ".xml"
 _STANDS = -1
-_MATRICES = (f"{m}.{part}" for m in ("transform", "vertices") for part in ("rows", "cols", "data"))
-_WANTED = frozenset(("label", "instanceId", "timestamp", *_MATRICES))
 _LONGEST_NAME = 80
 
 _COMPONENT = "[LiDARBoxComponent]"
@@ -176,7 +174,7 @@ def _read_kitti360(path: Path, clock: Clock) -> tuple[MovingBox, ...]:
     recorded = clock == "recorded"
     times = read_times(drive.of(SCANS, VELODYNE, "timestamps.txt")) if recorded else None
     found: list[MovingBox] = []
-    for stored in stored_objects(file, _WANTED):
+    for stored in stored_objects(file):
         if not stored.has("transform"):
             continue
         frame = stored.whole("timestamp")
