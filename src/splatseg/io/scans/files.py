@@ -180,7 +180,7 @@ def _open_las(path: Path) -> Generator[Any]:
     check_las_sizes(path)
     with reading(path, _LAS), path.open("rb") as file:
         try:
-            with laspy.open(file, closefd=False) as reader:
+            with laspy.open(file, closefd=False, read_evlrs=False) as reader:
                 yield reader
         except laspy.LaspyException as error:
             raise malformed(path, f"{_LAS}, but it cannot be read ({error!s:.100})") from error
