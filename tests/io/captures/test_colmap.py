@@ -239,7 +239,7 @@ def test_impossible_frames_are_refused(rig_capture, change, message) -> None:
 def test_a_frame_with_fewer_images_than_it_says_is_refused_at_once(tmp_path, count) -> None:
     path = tmp_path / "frames.txt"
     path.write_text("# comment\n1 1 1 0 0 0 0 0 0 2 CAMERA 1 11 CAMERA 2 12\n")
-    assert next(read_records(path)).images == ((1, 11), (2, 12))
+    assert next(read_records(path))[2] == ((1, 11), (2, 12))
     path.write_text(path.read_text().replace("0 2 CAMERA", f"0 {count} CAMERA"))
     with pytest.raises(FileFormatError, match=r"frames\.txt: line 2: expected FRAME_ID"):
         list(read_records(path))

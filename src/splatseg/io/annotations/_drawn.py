@@ -293,17 +293,8 @@ class _Task:
 
 def is_label_studio(content: object) -> bool:
     """Whether a JSON value is a list of tasks."""
-    return _first_has(content, "data", "annotations")
-
-
-def is_label_studio_min(content: object) -> bool:
-    """Whether a JSON value is the shortened export, which has no sizes of masks."""
-    return _first_has(content, "annotation_id", "lead_time")
-
-
-def _first_has(content: object, *keys: str) -> bool:
     first: object = content[0] if isinstance(content, list) and content else None
-    return isinstance(first, dict) and all(key in first for key in keys)
+    return isinstance(first, dict) and "data" in first and "annotations" in first
 
 
 def label_studio_annotations(path: Path, content: object) -> Annotations:

@@ -6,7 +6,7 @@ descriptions the first of the table wins. A layout more is a row more.
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 from splatseg._check import check_choice
 from splatseg.core import Capture, PointCloud
@@ -20,14 +20,6 @@ from splatseg.io.captures.points import read_metadata as read_metadata
 from splatseg.io.images import find_images
 
 
-class Reader(Protocol):
-    """Reads a capture of one layout."""
-
-    def __call__(self, path: Path, /, *, strict: bool) -> Capture:
-        """The capture at a path."""
-        ...
-
-
 class _Layout(NamedTuple):
     """How captures of a layout are found and read."""
 
@@ -35,7 +27,9 @@ class _Layout(NamedTuple):
     find: Callable[[Path], object]
     """Whether a folder is one: anything that counts as true."""
 
-    read: Reader
+    read: Callable[..., Capture]
+    """Takes the path, and `strict`."""
+
     files: tuple[str, ...] = ()
     """Names of files, beside others of the capture, that may stand for its folder."""
 
