@@ -185,13 +185,10 @@ def intrinsics_of(camera: ColmapCamera, *, where: str) -> Intrinsics:
     cx, cy, *distortion = values[lens.focals :]
     return Intrinsics(
         model=lens.model,
-        fx=values[0],
-        fy=values[lens.focals - 1],
-        cx=cx,
-        cy=cy,
+        focal=(values[0], values[lens.focals - 1]),
+        centre=(cx, cy),
         distortion=tuple(distortion),
-        width=camera.width,
-        height=camera.height,
+        size=(camera.width, camera.height),
     )
 
 

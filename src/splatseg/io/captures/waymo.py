@@ -367,13 +367,10 @@ def _calibrations(segment: WaymoSegment) -> dict[int, tuple[Intrinsics, NDArray[
         expect(sound, where, f"1 to {MAX_SIDE} pixels a side, got others")
         lens = Intrinsics(
             model="opencv",
-            fx=fx,
-            fy=fy,
-            cx=cx,
-            cy=cy,
+            focal=(fx, fy),
+            centre=(cx, cy),
             distortion=tuple(distortion),
-            width=width,
-            height=height,
+            size=(width, height),
         )
         found[camera] = lens, transform(row, extrinsic, where=where)
     return found
