@@ -19,6 +19,7 @@ import types
 import typing
 from collections.abc import Mapping, Sequence
 from dataclasses import is_dataclass
+from itertools import count, repeat
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, Union, cast
 
@@ -156,50 +157,50 @@ def _with_whole_numbers(value: Any) -> Any:
 
 
 @functools.cache
-def _has_numbers(kind: Any) -> bool:
-    """Whether a type has numbers that must be finite."""
-    args = typing.get_args(kind)
-    if typing.get_origin(kind) is Annotated:
+def _numbers_in(kind: Any) -> Any:
+    """Where a type has numbers that must be finite; None where it has none.
+
+    `float`, the types of fields by name, (class, type) of members of a union, or the type of items.
+    """
+    origin, args = typing.get_origin(kind), typing.get_args(kind)
+    if kind is float:
+        return float
+    if origin is Annotated:
         free = any(m.extra and m.extra.get("infinite") for m in args[1:] if hasattr(m, "extra"))
-        return not free and _has_numbers(args[0])
-    return kind is float or any(map(_has_numbers, _hints(kind).values() or args))
-
-
-@functools.cache
-def _hints(kind: Any) -> dict[str, Any]:
-    """Types of the fields of a dataclass; of other types none."""
-    declared = isinstance(kind, type) and is_dataclass(kind)
-    return typing.get_type_hints(kind, include_extras=True) if declared else {}
+        return None if free else _numbers_in(args[0])
+    if isinstance(kind, type) and is_dataclass(kind):
+        hints = typing.get_type_hints(kind, include_extras=True)
+        return {name: hint for name, hint in hints.items() if _numbers_in(hint)} or None
+    inner = [arg for arg in args if _numbers_in(arg)]
+    if origin not in (Union, types.UnionType):
+        return tuple(inner[:1]) or None
+    plain = ((typing.get_args(m)[0] if typing.get_origin(m) is Annotated else m) for m in inner)
+    return [(typing.get_origin(p) or p, one) for p, one in zip(plain, inner, strict=True)] or None
 
 
 def _strange(kind: Any, value: Any) -> tuple[str, float] | None:
     """Where in a value of a type a number is that is NaN, infinite or too large, and the number."""
-    if not _has_numbers(kind):
-        return None
-    if kind is float:
+    numbers = _numbers_in(kind)
+    if numbers is float:
         return None if abs(value) <= MAX_NUMBER else ("", value)
-    origin, args = typing.get_origin(kind), typing.get_args(kind)
-    if origin is Annotated:
-        return _strange(args[0], value)
-    if origin in (Union, types.UnionType):
-        plain = ((typing.get_args(m)[0] if typing.get_origin(m) is Annotated else m) for m in args)
-        fits = (isinstance(value, typing.get_origin(m) or m) for m in plain)
-        found = (_strange(member, value) for member, fit in zip(args, fits, strict=True) if fit)
-        return next(filter(None, found), None)
-    hints = _hints(kind)
-    inner = None if hints else next(filter(_has_numbers, args))
-    listed = value.values() if isinstance(value, dict) else value
-    if inner is float and all(abs(number) <= MAX_NUMBER for number in listed):
+    if isinstance(numbers, list):
+        for cls, one in numbers:
+            if isinstance(value, cls) and (bad := _strange(one, value)) is not None:
+                return bad
         return None
-    keyed = value.items() if isinstance(value, dict) else enumerate(() if hints else value)
-    parts = (
-        [(name, hints[name], getattr(value, name)) for name in hints]
-        if hints
-        else ((key, inner, item) for key, item in keyed)
-    )
-    for key, part, item in parts:
-        if (bad := _strange(part, item)) is not None:
-            return (f".{key}" if hints else f"[{quoted(key)}]") + bad[0], bad[1]
+    named = isinstance(numbers, dict)
+    if named:
+        parts = ((name, one, getattr(value, name)) for name, one in numbers.items())
+    elif numbers:
+        keys, items = (value, value.values()) if isinstance(value, dict) else (count(), value)
+        if _numbers_in(numbers[0]) is float and all(abs(item) <= MAX_NUMBER for item in items):
+            return None
+        parts = zip(keys, repeat(numbers[0]), items)
+    else:
+        return None
+    for key, one, part in parts:
+        if (bad := _strange(one, part)) is not None:
+            return (f".{key}" if named else f"[{quoted(key)}]") + bad[0], bad[1]
     return None
 
 
