@@ -475,12 +475,12 @@ def test_sog_names_stay_in_the_folder(golden: Path, tmp_path: Path) -> None:
         meta = json.loads(files["meta.json"])
         meta["quats"]["files"] = [name]
         (folder / "meta.json").write_text(json.dumps(meta))
-        with pytest.raises(FileFormatError, match="expected the name of a file beside it"):
+        with pytest.raises(FileFormatError, match="expected the name of a file in its folder"):
             read_splats(folder)
     (folder / "meta.json").write_bytes(files["meta.json"])
     (folder / "quats.webp").unlink()
     with pytest.raises(
-        MissingFileError, match=r"no such file as 'quats\.webp', which meta\.json names"
+        MissingFileError, match=r"a file 'quats\.webp', which meta\.json names, got none"
     ):
         read_splats(folder)
 

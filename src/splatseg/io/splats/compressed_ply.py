@@ -23,10 +23,11 @@ from splatseg.io.ply import PlyElement, PlyHeader, ply_header, read_ply_header, 
 from splatseg.io.splats._quantisation import pack_smallest_three, unpack_smallest_three
 from splatseg.io.splats._rows import (
     Array,
-    Filter,
     Losses,
     Rows,
     blocks,
+    drawing_comments,
+    drawn_as,
     finish,
     logs,
     to_rows,
@@ -92,7 +93,7 @@ def read_compressed_ply(path: Path, *, strict: bool = False) -> Gaussians:
             rows.sh[part, 1:] = _HARMONIC[steps].transpose(0, 2, 1)
     with np.errstate(over="ignore"):
         np.exp(rows.scales, out=rows.scales)
-    return finish(path, rows, strict=strict, drawn=Filter.from_comments(path, header.comments))
+    return finish(path, rows, strict=strict, **drawn_as(path, header.comments))
 
 
 def _harmonic_of_byte() -> Array:
@@ -195,7 +196,7 @@ def write_compressed_ply(gaussians: Gaussians, path: Path, *, losses: Losses) ->
         ]
         rest = [(f"f_rest_{i}", "|u1") for i in range(3 * (rows.sh.shape[1] - 1))]
         tables += [("sh", count, rest)] if rest else []
-        file.write(ply_header(tables, Filter.of(gaussians).comments()))
+        file.write(ply_header(tables, drawing_comments(gaussians)))
         file.write(bounds.tobytes())
         file.write(packed.tobytes())
         if rows.sh.shape[1] > 1:

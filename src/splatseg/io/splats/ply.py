@@ -25,10 +25,11 @@ from splatseg.io.foreign import expect
 from splatseg.io.ply import PlyElement, PlyHeader, ply_header, read_ply_tables
 from splatseg.io.splats._rows import (
     BLOCK,
-    Filter,
     Losses,
     Rows,
     blocks,
+    drawing_comments,
+    drawn_as,
     finish,
     logits,
     logs,
@@ -215,8 +216,8 @@ def read_ply(
         _smooth(rows, filters, axes=len(columns.scales))
     if len(columns.scales) == 2:
         rows.scales[:, 2] = _FLAT * rows.scales[:, :2].min(axis=1)
-    drawn = Filter.from_comments(path, header.comments)
-    return finish(path, rows, _restore(header, extra), strict=strict, drawn=drawn)
+    drawn = drawn_as(path, header.comments)
+    return finish(path, rows, _restore(header, extra), strict=strict, **drawn)
 
 
 def _find_columns(path: Path, header: PlyHeader, *, own: bool) -> tuple[PlyElement, _Columns]:
@@ -425,7 +426,7 @@ def write_ply(gaussians: Gaussians, path: Path, *, losses: Losses) -> None:
     _check_names(extra, standard)
     fields = [(name, "<f4") for name in standard]
     fields += [(name, column.dtype.str) for name, column in extra.items() if name not in standard]
-    comments = [*Filter.of(gaussians).comments(), *notes]
+    comments = [*drawing_comments(gaussians), *notes]
     with path.open("wb") as file:
         file.write(ply_header([("vertex", len(gaussians), fields)], comments))
         for part in blocks(len(gaussians), BLOCK // 4):
