@@ -373,12 +373,9 @@ def capture_of_world(world: SavedWorld, photographs: Sequence[Photograph], root:
             image=one.path,
             relative=one.path.relative_to(root).as_posix(),
             intrinsics=Intrinsics(
-                fx=focal,
-                fy=focal,
-                cx=one.width / 2,
-                cy=one.height / 2,
-                width=one.width,
-                height=one.height,
+                focal=(focal, focal),
+                centre=(one.width / 2, one.height / 2),
+                size=(one.width, one.height),
             ),
             cam_from_world=pose.numpy(),
         )

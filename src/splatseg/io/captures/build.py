@@ -295,7 +295,7 @@ def _cameras(
             first = first or error
             continue
         for what, (width, height) in (
-            ("intrinsics", (written.width or size[0], written.height or size[1])),
+            ("intrinsics", written.size or size),
             ("masks", mask),
         ):
             if (width, height) != size:

@@ -132,13 +132,8 @@ def _read_arrays(path: Path) -> MaskSet:
     whole = (levels == np.trunc(levels)) & (levels >= _INT32.min) & (levels <= _INT32.max)
     what = f"a whole number as level for each of {len(masks)} masks, from {_INT32.min} to "
     expect(whole.all(), path, f"{what}{_INT32.max}, got others")
-    return MaskSet(
-        height=int(masks.shape[1]),
-        width=int(masks.shape[2]),
-        masks=tuple(Rle.encode(torch.from_numpy(mask != 0)) for mask in masks),
-        scores=torch.from_numpy(scores.astype(np.float32)).clamp(0, 1),
-        levels=torch.from_numpy(levels.astype(np.int32)),
-    )
+    rles = [Rle.encode(torch.from_numpy(mask != 0)) for mask in masks]
+    return _mask_set(rles, scores.tolist(), levels.tolist(), masks.shape[1:])
 
 
 def _of_masks(

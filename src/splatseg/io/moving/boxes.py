@@ -14,7 +14,7 @@ An object has ``timestamp``: the frame in which it was there, or -1 of what stan
 out here. Its box is ``vertices`` (8, of half a metre to each side) under ``transform`` (4 x 4, with
 the lengths of the box), in the world of the poses.
 
-Waymo has lidar_box, or laser_labels of frames of version 1. A box is upright in the axes of the
+Waymo has lidar_box. A box is upright in the axes of the
 vehicle in its frame; it has a place, lengths, a heading about z, and the velocity of the thing,
 m/s. Sun et al., CVPR 2020.
 """
@@ -39,13 +39,13 @@ from splatseg.io.captures.kitti360 import SCANS, VELODYNE, Drive, find_drive
 from splatseg.io.captures.waymo import (
     BOXES,
     MICROSECOND,
+    OLD_SUFFIX,
     SUFFIX,
     TIMESTAMP,
     VEHICLE_POSES,
     find_segments,
     one_segment,
 )
-from splatseg.io.captures.waymo_tfrecord import ENDING
 from splatseg.io.foreign import expect, is_file, is_folder, made_from, malformed
 from splatseg.io.json_files import read_json, write_json
 from splatseg.io.moving.views import CLOCKS, Clock
@@ -58,8 +58,6 @@ FOLDER = "data_3d_bboxes"
 _SPLITS = ("train_full", "train")
 _SUFFIX = ".xml"
 _STANDS = -1
-_MATRICES = (f"{m}.{part}" for m in ("transform", "vertices") for part in ("rows", "cols", "data"))
-_WANTED = frozenset(("label", "instanceId", "timestamp", *_MATRICES))
 _LONGEST_NAME = 80
 
 _COMPONENT = "[LiDARBoxComponent]"
@@ -97,7 +95,7 @@ def read_moving(path: Path, *, clock: Clock = "recorded") -> tuple[MovingBox, ..
         MissingPackageError: If it is of Waymo, and pyarrow is not installed.
     """
     check_choice("clock", clock, CLOCKS)
-    if path.suffix in (SUFFIX, ENDING) or (
+    if path.suffix in (SUFFIX, OLD_SUFFIX) or (
         path.is_dir() and any(segment.has(BOXES) for segment in find_segments(path))
     ):
         return _read_waymo(path, clock)
@@ -176,7 +174,7 @@ def _read_kitti360(path: Path, clock: Clock) -> tuple[MovingBox, ...]:
     recorded = clock == "recorded"
     times = read_times(drive.of(SCANS, VELODYNE, "timestamps.txt")) if recorded else None
     found: list[MovingBox] = []
-    for stored in stored_objects(file, _WANTED):
+    for stored in stored_objects(file):
         if not stored.has("transform"):
             continue
         frame = stored.whole("timestamp")
