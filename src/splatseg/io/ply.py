@@ -10,9 +10,10 @@ property list uchar int vertex_indices
 end_header
 """
 
-from collections.abc import Collection, Generator, Mapping, Sequence
+from collections.abc import Collection, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +21,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatseg.errors import FileFormatError, quoted, reason
-from splatseg.io.foreign import expect, read_bytes, reading
+from splatseg.io.foreign import expect, reading
 from splatseg.io.text_numbers import number_table
 
 MAX_HEADER = 1 << 20
 """Bytes in which the header must end; real ones have two or three thousand."""
+
+_TEXT_ROWS = 1 << 14
+"""Rows of an ASCII file that are parsed together."""
 
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
@@ -109,8 +113,8 @@ class PlyTable:
 
     count: int
     numbers: Mapping[str, NDArray[Any]]
-    """Columns of numbers by name, of binary files views of the file; real ones of text are float64,
-    others have the type that the header says."""
+    """Columns of numbers by name, of binary files views of the file; real ones of text may be
+    float64, others have the type that the header says."""
 
     lists: Mapping[str, PlyLists] = field(default_factory=dict[str, PlyLists])
 
@@ -220,14 +224,14 @@ def read_ply_tables(
         header: What `read_ply_header` gives.
         names: The elements.
         whole: Go through what is behind them too, up to an element that has lists: the file must
-            be as long as its header says.
+            be as long as its header says. Numbers of text have the types of the header then.
 
     Raises:
         FileFormatError: If the file ends early, or a row is not what the header says.
     """
     found: dict[str, PlyTable] = {}
     wanted = [element.name for element in header.elements if element.name in names]
-    reader = _BinaryRows(path, header) if header.order else _TextRows(path, header)
+    reader = _BinaryRows(path, header) if header.order else _TextRows(path, header, declared=whole)
     for element in header.elements:
         if len(found) == len(wanted) and (element.lists or not whole):
             return found
@@ -350,37 +354,59 @@ class _BinaryRows:
 
 
 class _TextRows:
-    """Goes through the elements of an ASCII file, one row a line."""
+    """Goes through the elements of an ASCII file, one row a line, some thousands at once."""
 
-    def __init__(self, path: Path, header: PlyHeader) -> None:
-        self._path = path
-        lines = read_bytes(path, _KIND)[header.offset :].split(b"\n")
-        self._lines = [line for line in lines if line and not line.isspace()]
-        self._at = 0
+    def __init__(self, path: Path, header: PlyHeader, *, declared: bool) -> None:
+        self._path, self._declared = path, declared
+        with reading(path, _KIND):
+            self._bytes = path.stat().st_size - header.offset
+        self._lines = _text_lines(path, header.offset)
 
     def left(self) -> str:
         """What was not gone through."""
-        more = len(self._lines) - self._at
+        more = sum(1 for _ in self._lines)
         return f"{more} lines" if more else ""
 
     def next(self, element: PlyElement) -> PlyTable:
         """The table of the next element."""
-        lines = self._lines[self._at : self._at + element.count]
-        self._at += element.count
-        what = f"{element.count} rows of {quoted(element.name)}, got {len(lines)}"
-        expect(len(lines) == element.count, self._path, what)
-        with _parsing(
-            self._path, f"{element.count} rows of {len(element.properties)} numbers", element
-        ):
-            return _parsed(element, lines)
+        count, columns = element.count, len(element.properties)
+        # A value takes a digit and what parts it from the next: memory is taken for what can be.
+        have = self._bytes
+        fits = have >= 2 * count * columns - 1
+        expect(fits, self._path, f"{count} rows of {quoted(element.name)}, got {have} bytes")
+        with _parsing(self._path, f"{count} rows of {columns} numbers", element):
+            if element.lists:
+                return _with_lists(element, self._rows(element, 0, count))
+            types = [np.float64 if one.code[0] == "f" else one.code for one in element.properties]
+            numbers = {
+                name: np.empty(count, kind) for name, kind in zip(element.names, types, strict=True)
+            }
+            for start in range(0, count, _TEXT_ROWS):
+                stop = min(start + _TEXT_ROWS, count)
+                table = number_table(self._rows(element, start, stop), columns)
+                with np.errstate(over="ignore"):  # beyond float32: infinite, which readers refuse
+                    for one, values in zip(element.properties, table.T, strict=True):
+                        numbers[one.name][start:stop] = _typed(values, one)
+            return PlyTable(count=count, numbers=numbers)
+
+    def _widens(self, column: PlyProperty) -> bool:
+        """Whether it keeps what text has beyond its type, as for coordinates of a whole earth."""
+        return column.code[0] == "f" and not self._declared
+
+    def _rows(self, element: PlyElement, start: int, stop: int) -> list[bytes]:
+        lines = list(islice(self._lines, stop - start))
+        what = f"{element.count} rows of {quoted(element.name)}, got {start + len(lines)}"
+        expect(len(lines) == stop - start, self._path, what)
+        return lines
 
 
-def _parsed(element: PlyElement, lines: list[bytes]) -> PlyTable:
-    if not element.lists:
-        table = number_table(lines, len(element.properties))
-        columns = zip(element.properties, table.T, strict=True)
-        numbers = {one.name: _typed(values, one) for one, values in columns}
-        return PlyTable(count=element.count, numbers=numbers)
+def _text_lines(path: Path, offset: int) -> Iterator[bytes]:
+    with path.open("rb") as file:
+        file.seek(offset)
+        yield from (line for line in file if not line.isspace())
+
+
+def _with_lists(element: PlyElement, lines: Sequence[bytes]) -> PlyTable:
     rows = _Columns(element)
     for line in lines:
         words = [float(word) for word in line.split()]
