@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -22,6 +23,7 @@ from splatseg.io.scene_folder import POSES_FOLDER
 from splatseg.models import model_names
 from splatseg.pose import (
     PoseOptions,
+    PoseProgress,
     PoseReport,
     PoseResult,
     holds_photographs,
@@ -44,7 +46,7 @@ from splatseg.pose.pointmaps import (
 from splatseg.tasks.checkpoints import CheckpointOptions
 from splatseg.tasks.moving import MovingClock
 from splatseg.tasks.see import model_of, name_of
-from splatseg.tasks.work import Observer, check_parent
+from splatseg.tasks.work import Observer, Step, check_parent
 
 Poses = Literal["auto", "given", "sfm", "pointmaps"]
 """Where cameras come from."""
@@ -187,11 +189,18 @@ def capture_of(
         )
     check_utf8(data)
     how = PoseOptions(seed=seed, frames=options.frames)
-    with observer.pose_stage() as step:
-        result = recover_poses(data, folder=scene / POSES_FOLDER, options=how, progress=step)
+    with observer.stage("poses") as step:
+        result = recover_poses(
+            data, folder=scene / POSES_FOLDER, options=how, progress=partial(_told, step)
+        )
     for line in _sentences(data, scene / POSES_FOLDER, result):
         observer.info(line)
     return result.capture, result.report
+
+
+def _told(step: Step, now: PoseProgress) -> None:
+    """Stages take differently long: their names say more than an estimate of the whole."""
+    step(now.done, 0, f"{now.stage} {now.done}/{now.total}" if now.total else now.stage)
 
 
 def _without_poses(data: Path, format: str, poses: Poses) -> bool:
@@ -280,8 +289,10 @@ def capture_of_pointmaps(
     if max_points is not None:
         options = PointmapOptions(seed=seed, max_points=max_points)
     folder = scene / POSES_FOLDER
-    with observer.pose_stage() as step:
-        result = recover_from_pointmaps(data, source, folder=folder, options=options, progress=step)
+    with observer.stage("poses") as step:
+        result = recover_from_pointmaps(
+            data, source, folder=folder, options=options, progress=partial(_told, step)
+        )
     for line in _pointmap_sentences(data, folder, result):
         observer.info(line)
     return result.capture, result.report
