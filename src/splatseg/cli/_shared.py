@@ -108,19 +108,6 @@ Overwrite: TypeAlias = Annotated[
     bool, _flag(None, "Replace what an earlier run wrote under the same name.")
 ]
 
-Split: TypeAlias = Annotated[
-    str, _flag("SPLIT", "Views: test, train, another split of the scene, or all.")
-]
-
-SplitOrPath: TypeAlias = Annotated[
-    str,
-    _flag(
-        "SPLIT",
-        "Views: test, train, another split of the scene, all, or path: a smooth path near the "
-        "training cameras.",
-    ),
-]
-
 Frames: TypeAlias = Annotated[int, _flag("N", "Number of views of a path.")]
 
 Json: TypeAlias = Annotated[

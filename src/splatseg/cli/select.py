@@ -12,7 +12,7 @@ import torch
 import tyro
 from torch import Tensor
 
-from splatseg.cli._shared import Device, Downloads, OnScene, Seed, print_result
+from splatseg.cli._shared import Device, Downloads, OnScene, print_result
 from splatseg.core import PromptableMasks, Scene, Selection, View
 from splatseg.core.instance_tree import layer_kind
 from splatseg.core.models import GroundedMasks, TextFeatures
@@ -63,7 +63,6 @@ class _Options(SelectOptions):
     (objects) to 1 (the finest parts). auto: chosen by the source."""
 
     mode: Annotated[SelectMode, tyro.conf.Suppress] = "new"
-    seed: Seed = 0
 
 
 _Repeated = tyro.conf.UseAppendAction
@@ -103,6 +102,7 @@ class Command(OnScene):
     REMOVED: ClassVar[dict[str, str]] = {
         "next_click": "followed on measured scenes, its advice did not raise the IoU"
     }
+    """Flags that went, and why."""
 
     layer: str = "selection"
     """Name of the layer to write."""

@@ -101,7 +101,7 @@ class SelectOptions:
     with it."""
 
     seed: int = 0
-    """Seed of random choices, recorded in the layer."""
+    """Seed of all random choices."""
 
     @property
     def level(self) -> float | None:

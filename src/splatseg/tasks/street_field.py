@@ -49,16 +49,6 @@ _CELLS = 5
 """Points are thinned to so many cells along the side of the finest voxel."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class BuiltField:
-    """A mesh field with its record, and how it came to be."""
-
-    field: MeshField
-    fit: MeshFieldFit
-    sources: str
-    """Where points and depth came from, in words."""
-
-
 class FieldBuilder:
     """Builds fields from what all blocks of a drive have in common.
 
@@ -90,8 +80,8 @@ class FieldBuilder:
         points: Float[Tensor, "n 3"] | None,
         near: Callable[[Float[Tensor, "n 3"]], Bool[Tensor, "n"]] | None = None,
         details: Mapping[str, Any] | None = None,
-    ) -> BuiltField:
-        """Build the field of some views.
+    ) -> tuple[MeshField, MeshFieldFit, str]:
+        """Build the field of some views: it with its record, how, and whence in words.
 
         Args:
             views: To learn from.
@@ -106,7 +96,7 @@ class FieldBuilder:
         began = time.monotonic()
         inputs, observer = self.inputs, self.work.observer
         observer.info("points and depth are gathered")
-        sources = drive_sources(
+        cloud, depths, said = drive_sources(
             self.work,
             views,
             depth=self.options.depth,
@@ -114,14 +104,14 @@ class FieldBuilder:
             points=points,
             cell=min(self.chosen.voxels) / inputs.metres / _CELLS,
         )
-        observer.info(f"from {sources.said}")
-        cloud = sources.points if near is None else sources.points[near(sources.points)]
+        observer.info(f"from {said}")
+        cloud = cloud if near is None else cloud[near(cloud)]
         self._took("points", time.monotonic() - began)
         with _stages(observer, self._took) as told:
             made = build_mesh_field(
                 MeshFieldInputs(
                     points=cloud,
-                    depths=sources.depths(),
+                    depths=depths(),
                     views=views,
                     evidence=inputs.evidence,
                     classes=inputs.evidence.classes or self.work.scene.classes,
@@ -133,7 +123,7 @@ class FieldBuilder:
                 progress=told,
             )
         left_out = {} if inputs.moving is None else {"moving": inputs.moving.record}
-        more = {"sources": sources.said, **left_out, **(details or {})}
+        more = {"sources": said, **left_out, **(details or {})}
         info = replace(
             made.field.info,
             evidence=inputs.name,
@@ -141,8 +131,7 @@ class FieldBuilder:
             versions=layer_versions(),
             details={**made.field.info.details, **more},
         )
-        field = made.field.with_layer(info=info)
-        return BuiltField(field=field, fit=made, sources=sources.said)
+        return made.field.with_layer(info=info), made, said
 
     def _took(self, stage: str, seconds: float) -> None:
         self.timings[stage] = self.timings.get(stage, 0.0) + seconds
@@ -312,20 +301,20 @@ def street_field(
     work = Work(scene=scene, backend=backend, observer=observer)
     with drive_inputs(work, options) as inputs:
         builder = FieldBuilder(work, inputs, options, field_options)
-        made = builder.build(
+        field, fit, said = builder.build(
             inputs.views,
             scans=inputs.scans,
             points=capture_points(inputs.capture) if points is None else points,
         )
     return StreetField(
-        field=made.field,
+        field=field,
         name=options.field,
-        layer=made.field.layer_names[0],
-        fit=made.fit,
+        layer=field.layer_names[0],
+        fit=fit,
         # As the scene has them: masks without moving things were there for the training alone.
         views=tuple(scene.view(view.name) for view in inputs.views),
         evidence=inputs.evidence,
-        sources=made.sources,
+        sources=said,
         moving=inputs.moving,
         timings=builder.timings,
     )
