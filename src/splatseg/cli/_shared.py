@@ -8,7 +8,7 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, Any, TypeAlias, TypeVar
 
 import tyro
 from rich.console import Console
@@ -30,6 +30,8 @@ from splatseg.io.splats import Values
 from splatseg.render import BackendName
 from splatseg.tasks import Observer
 from splatseg.tasks.work import Step
+
+T = TypeVar("T")
 
 
 def _flag(metavar: str | None, help: str, *aliases: str) -> Any:
@@ -246,6 +248,27 @@ def progress(what: str, *, quiet: bool = False) -> Generator[Step]:
             bar.update(task, description=words, completed=done, total=total or None)
 
         yield show
+
+
+def named_model(command: Any, option: str, protocol: type[T], does: str) -> T | None:
+    """The model that an option of a command names, see `model_for`; None where it names none.
+
+    The command has `Downloads` and `Device` as ``download`` and ``device``.
+    """
+    from splatseg.tasks.see import model_for  # here: most commands need no models
+
+    named = getattr(command, option)
+    if named is None:
+        return None
+    return model_for(
+        option,
+        named,
+        protocol,
+        does,
+        download=command.download,
+        device=command.device,
+        report=command.observer.note,
+    )
 
 
 def typed(words: Sequence[str]) -> str:

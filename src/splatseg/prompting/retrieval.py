@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float, Float32
 from torch import Tensor
 
-from splatseg._check import check_choice, check_finite, check_shape
+from splatseg._check import check_finite, check_shape
 from splatseg._native import match_features
 from splatseg.core.boundary import boundary
 from splatseg.errors import RangeError, ShapeError
@@ -79,8 +79,6 @@ class StoredFeatures:
             raise ShapeError(
                 f"values: expected shape (any, 1 to {MAX_CHANNELS}), got {tuple(values.shape)}."
             )
-        check_choice("precision", precision, _DTYPES)
-        check_choice("similarity", similarity, ("cosine", "dot"))
         check_finite("values", values)
         table = values.detach().cpu().float()
         if similarity == "cosine":
