@@ -10,9 +10,8 @@ from jaxtyping import Bool, Float, Int, UInt8
 from PIL import Image, ImageDraw
 from torch import Tensor
 
-from splatseg._check import check_shape
 from splatseg.core import ClassTable
-from splatseg.errors import InputError
+from splatseg.core.boundary import convert_fields
 from splatseg.report.colours import NOTHING, Colour, colour_labels
 
 _WRONG: Colour = (226, 48, 48)
@@ -41,9 +40,7 @@ class GalleryImage:
     """A photo is embedded as JPEG, a chart (few flat colours) as PNG without loss."""
 
     def __post_init__(self) -> None:
-        check_shape("image", self.image, (None, None, 3))
-        if self.image.dtype != torch.uint8:
-            raise InputError(f"image: expected 8-bit colours (uint8), got {self.image.dtype}.")
+        convert_fields(self)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
