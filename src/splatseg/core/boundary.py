@@ -120,8 +120,9 @@ def convert_fields(value: Any) -> None:
         if made is not given:
             object.__setattr__(value, name, made)
         if axes and made is not None:
-            check_shape(name, made, [int(a) if a.isdecimal() else lengths.get(a) for a in axes])
-            lengths.update(zip(axes, made.shape, strict=True))
+            pairs = list(zip(axes, made.shape, strict=True))
+            check_shape(name, made, [lengths.get(axis, length) for axis, length in pairs])
+            lengths.update(pairs)
 
 
 @functools.cache
@@ -267,6 +268,8 @@ def _one_of(members: tuple[Any, ...]) -> Converter | None:
                 errors.append(error)
         if made:
             return next((one for one in made if one is value), made[0])
+        if misshapen := next((one for one in errors if isinstance(one, ShapeError)), None):
+            raise misshapen
         words = " or ".join(dict.fromkeys(_called(member) for member, _ in attempts))
         raise InputError(f"{name}: expected {words}, got {describe(value)}.") from errors[0]
 
@@ -435,9 +438,6 @@ def _tensor_of(annotation: Any) -> Converter | None:
                     "if these are no ids, x / 255 for pixels."
                 )
             tensor = as_tensor(name, tensor, kind)
-        if axes and fixed and not tensor.ndim:
-            shown = ", ".join(axis if axis.isdecimal() else "any" for axis in axes)
-            raise ShapeError(f"{name}: expected shape ({shown}), got ().")
         if fixed and axes and tensor.ndim == len(axes) - 1 > 0:
             if axes[-1] == "channels":
                 return tensor.unsqueeze(-1)
@@ -448,6 +448,8 @@ def _tensor_of(annotation: Any) -> Converter | None:
                 f"{name}: expected an image (height, width, 3) of at least a pixel, "
                 f"got {tuple(tensor.shape)}."
             )
+        if fixed and axes:
+            check_shape(name, tensor, [int(a) if a.isdecimal() else None for a in axes])
         return tensor
 
     return convert

@@ -63,7 +63,6 @@ class Rle:
     @boundary
     def encode(cls, mask: Bool[Tensor, "height width"]) -> "Rle":
         """Run lengths of a boolean mask."""
-        check_shape("mask", mask, (None, None))
         height, width = (int(s) for s in mask.shape)
         flat = mask.to(torch.bool).cpu().numpy().T.reshape(-1)
         changes = np.flatnonzero(flat[1:] != flat[:-1]) + 1
@@ -190,7 +189,6 @@ class MaskSet(Previewed):
         levels: Sequence[int] | Tensor | None = None,
     ) -> "MaskSet":
         """Encode boolean masks; scores default to 1 and levels to 0."""
-        check_shape("masks", masks, (None, None, None))
         count, height, width = (int(s) for s in masks.shape)
         return cls(
             height=height,

@@ -28,11 +28,9 @@ def signs_of_points(points: Tensor, positive: Tensor | None) -> Tensor:
         ShapeError: If points are not p x 2, or signs are not of p points.
         RangeError: If a coordinate is not finite.
     """
-    check_shape("points", points, (None, 2))
     check_finite("points", points)
     if positive is None:
         return torch.ones(len(points), dtype=torch.bool)
-    check_shape("positive", positive, (len(points),))
     return positive.to(torch.bool)
 
 

@@ -308,7 +308,6 @@ def inside_boxes(
         ShapeError: If the points are not (p, 3).
         RangeError: If the margin is negative or not finite.
     """
-    check_shape("points", points, (None, 3))
     at = points.detach().cpu().double()
     inside = torch.zeros(len(at), dtype=torch.bool)
     for box in boxes:

@@ -33,7 +33,6 @@ def cell_order(cells: Int[Tensor, "m 3"]) -> Int[Tensor, "m"]:
     Raises:
         RangeError: If a coordinate is beyond `MAX_CELL`.
     """
-    check_shape("cells", cells, (None, 3))
     cells = cells.long()
     if len(cells) and int(cells.abs().max()) >= MAX_CELL:
         raise RangeError(
