@@ -119,8 +119,6 @@ class RayCaster:
 
     @boundary
     def __init__(self, vertices: Float[Tensor, "n 3"], faces: Int[Tensor, "m 3"]) -> None:
-        check_shape("vertices", vertices, (None, 3))
-        check_shape("faces", faces, (None, 3))
         check_finite("vertices", vertices)
         if not len(faces):
             raise InputError("faces: expected at least one triangle, got none.")
@@ -151,7 +149,6 @@ class RayCaster:
             ShapeError: If there is not one origin, or as many as directions.
             RangeError: If a value is not finite, or a direction is 0.
         """
-        check_shape("directions", directions, (None, 3))
         check_shape("origins", origins, (3,) if origins.ndim < 2 else (len(directions), 3))
         check_finite("origins", origins)
         check_finite("directions", directions)

@@ -114,7 +114,7 @@ def test_heads_of_other_kinds_are_refused() -> None:
     [
         ({"channels": 0}, RangeError, "channels: expected at least 1"),
         ({"gate_bias": None}, InputError, "expected both or none"),
-        ({"gate_weight": torch.zeros(3)}, ShapeError, "gate_weight"),
+        ({"gate_weight": torch.zeros(3)}, ShapeError, r"gate_bias: expected shape \(3\), got"),
         ({"scale_quantiles": torch.zeros(5, dtype=torch.float64)}, ShapeError, "scale_quantiles"),
         (
             {"scale_quantiles": torch.linspace(1, 0, 101, dtype=torch.float64)},

@@ -130,7 +130,7 @@ def test_what_is_not_finite_is_refused(bad: float) -> None:
 
 def test_arguments_are_checked() -> None:
     index = NeighbourIndex(ROW)
-    with pytest.raises(ShapeError, match=r"points: expected shape \(any, 1 to 8\), got \(5,\)"):
+    with pytest.raises(ShapeError, match=r"points: expected shape \(any, any\), got \(5,\)"):
         NeighbourIndex(torch.zeros(5))
     with pytest.raises(ShapeError, match="points: expected shape"):
         NeighbourIndex(torch.zeros(5, 9))

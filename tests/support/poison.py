@@ -480,7 +480,7 @@ def inner(world: World, by_type: dict[type, Any]) -> dict[str, Any]:
         "core.Pointmap.points": torch.rand(2, 3, 3),
         "core.Pointmap.confidence": torch.ones(2, 3),
         "render.SparseWeights.gaussians": COUNT,
-        "render.SparseWeights.weights": torch.zeros(1),
+        "render.SparseWeights.weights": torch.zeros(6),
         "io.evidence.save_tracks.tracks": (),
         "io.evidence.save_tracks.folder": world.path().parent,
         "io.evidence.save_segments.segments": {},

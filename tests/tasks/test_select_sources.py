@@ -199,10 +199,8 @@ def test_a_scene_without_anything_says_what_to_make(room) -> None:
 def test_features_of_the_scene_folder_are_found(room) -> None:
     scene = load_scene(room)
     save_scene_layer(affinity(len(scene.gaussians)), room, "affinity")
-    made = select(load_scene(room), click(scene), advise=True)
+    made = select(load_scene(room), click(scene))
     assert (made.source, made.selection.info.options["layer"]) == ("features", "affinity")
-    assert "next_click" in made.seconds
-    assert "next_click" not in select(load_scene(room), click(scene)).seconds
 
 
 def test_features_trained_as_published_are_asked_as_published(room) -> None:
@@ -223,7 +221,7 @@ def test_features_trained_as_published_are_asked_as_published(room) -> None:
     assert record("own") == ("fixed", None, every)
     assert record("paper") == ("adaptive", "published", ["filter", "grow"])
     assert record("paper", post_processing="none") == ("adaptive", None, [])
-    assert record("own", threshold="code") == ("code", None, every)
+    assert record("own", threshold="adaptive") == ("adaptive", None, every)
     assert record("paper", post_processing="full", threshold="fixed") == ("fixed", None, every)
     assert record("own", post_processing="published")[1:] == ("published", ["filter", "grow"])
     tree = SelectOptions(post_processing="published", from_layer="all")
@@ -243,7 +241,7 @@ def test_features_trained_as_published_are_asked_as_published(room) -> None:
 
 
 def test_thresholds_change_what_is_selected(room) -> None:
-    """Of features of one direction each but for noise: the mean is below 0.85, the code's above."""
+    """Of features of one direction each but for noise: the mean is below 0.85."""
     scene = load_scene(room)
     count = len(scene.gaussians)
     angles = torch.linspace(0, 3, count)
@@ -256,4 +254,4 @@ def test_thresholds_change_what_is_selected(room) -> None:
         )
         return select(scene, click(scene), options=options, layers=layers).selection.count
 
-    assert selected("adaptive") > selected("fixed") > selected("code")
+    assert selected("adaptive") > selected("fixed")

@@ -10,13 +10,9 @@ import tyro
 
 from splatseg.cli._shared import (
     Backend,
-    Format,
-    Linear,
     MadeSceneFolder,
-    Overwrite,
     Printing,
     Seed,
-    Strict,
     print_result,
     typed,
 )
@@ -25,13 +21,6 @@ from splatseg.report.fit_report import scored_of
 from splatseg.tasks import ImportOptions, MadeScene, MakeSceneOptions, fit_capture, import_scene
 
 _DEFAULT = FitOptions()
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Scene(MakeSceneOptions):
-    format: Format = "auto"
-    strict: Strict = False
-    overwrite: Overwrite = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,7 +100,9 @@ class Command(Printing):
     seed: Seed = 0
     backend: Backend = "auto"
 
-    capture: Annotated[_Scene, tyro.conf.arg(name="")] = field(default_factory=_Scene)
+    capture: Annotated[MakeSceneOptions, tyro.conf.arg(name="")] = field(
+        default_factory=MakeSceneOptions
+    )
     """How photographs are read, where cameras come from, and how a stopped fit goes on."""
 
 
@@ -202,13 +193,6 @@ def _lines(made: MadeScene) -> list[str]:
     ]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Import(ImportOptions):
-    format: Format = "auto"
-    strict: Strict = False
-    linear: Linear = ()
-
-
 @dataclass(frozen=True, kw_only=True)
 class ImportCommand(Printing):
     """Make a scene of a splat file, with its photographs or with virtual cameras.
@@ -232,7 +216,9 @@ class ImportCommand(Printing):
 
     output: MadeSceneFolder
 
-    importing: Annotated[_Import, tyro.conf.arg(name="")] = field(default_factory=_Import)
+    importing: Annotated[ImportOptions, tyro.conf.arg(name="")] = field(
+        default_factory=ImportOptions
+    )
     """The capture, or virtual cameras."""
 
     backend: Backend = "auto"

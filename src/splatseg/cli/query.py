@@ -9,7 +9,15 @@ from typing import Annotated, Any
 
 import tyro
 
-from splatseg.cli._shared import Device, Downloads, Frames, OnScene, print_result, typed
+from splatseg.cli._shared import (
+    Device,
+    Downloads,
+    Frames,
+    OnScene,
+    named_model,
+    print_result,
+    typed,
+)
 from splatseg.core import Scene, View
 from splatseg.core.models import TextFeatures
 from splatseg.errors import InputError
@@ -23,7 +31,6 @@ from splatseg.tasks import (
     draw_heat,
     write_query_report,
 )
-from splatseg.tasks.see import model_for
 from splatseg.tasks.work import Work
 
 _LISTED = 5
@@ -109,17 +116,7 @@ def run(command: Command) -> None:
         check_name("layer", command.layer)
     scene = command.open()
     views = _views(command, scene)
-    encoder = None
-    if command.model is not None:
-        encoder = model_for(
-            "model",
-            command.model,
-            TextFeatures,
-            "encodes words, such as clip",
-            download=command.download,
-            device=command.device,
-            report=observer.note,
-        )
+    encoder = named_model(command, "model", TextFeatures, "encodes words, such as clip")
     writes = ["layers", *(["reports"] if command.report else [])]
     with work_on_scene(command.scene, "query", writes=writes):
         session = QuerySession(

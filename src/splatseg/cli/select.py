@@ -5,14 +5,14 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 import numpy as np
 import torch
 import tyro
 from torch import Tensor
 
-from splatseg.cli._shared import Device, Downloads, OnScene, Seed, print_result
+from splatseg.cli._shared import Device, Downloads, OnScene, named_model, print_result
 from splatseg.core import PromptableMasks, Scene, Selection, View
 from splatseg.core.instance_tree import layer_kind
 from splatseg.core.models import GroundedMasks, TextFeatures
@@ -44,7 +44,7 @@ from splatseg.tasks import (
     select_text,
     text_prompts,
 )
-from splatseg.tasks.see import model_for, prompter_of
+from splatseg.tasks.see import prompter_of
 from splatseg.tasks.work import Work
 
 _T = TypeVar("_T")
@@ -63,7 +63,6 @@ class _Options(SelectOptions):
     (objects) to 1 (the finest parts). auto: chosen by the source."""
 
     mode: Annotated[SelectMode, tyro.conf.Suppress] = "new"
-    seed: Seed = 0
 
 
 _Repeated = tyro.conf.UseAppendAction
@@ -99,6 +98,11 @@ class Command(OnScene):
 
     splatseg select room --text "red mug" --layer mug --picture found
     """
+
+    REMOVED: ClassVar[dict[str, str]] = {
+        "next_click": "followed on measured scenes, its advice did not raise the IoU"
+    }
+    """Flags that went, and why."""
 
     layer: str = "selection"
     """Name of the layer to write."""
@@ -167,10 +171,6 @@ class Command(OnScene):
 
     download: Downloads = False
     device: Device = "auto"
-
-    next_click: bool = False
-    """Also compute where another click would change most. Followed on measured scenes, the advice
-    did not raise the IoU."""
 
     save: Path | None = None
     """Also write the selected Gaussians alone: a splat file such as mug.ply, or a folder, in which
@@ -255,7 +255,7 @@ def _clicked(
     )
     try:
         with session:
-            return session.select(prompts, base=base, advise=command.next_click)
+            return session.select(prompts, base=base)
     finally:
         # Masks take a while to associate: their tree is kept, even where it has no answer.
         for name, layer in session.made_layers.items():
@@ -292,29 +292,14 @@ def _by_text(
         ),
         select_options=options,
         models=TextModels(
-            grounder=_model(command, "grounder", GroundedMasks, "finds words in images"),
+            grounder=named_model(command, "grounder", GroundedMasks, "finds words in images"),
             prompter=prompter,
-            encoder=_model(command, "encoder", TextFeatures, "encodes words"),
+            encoder=named_model(command, "encoder", TextFeatures, "encodes words"),
         ),
         places=places,
         base=base,
         backend=command.backend,
         observer=command.observer,
-    )
-
-
-def _model(command: Command, option: str, protocol: type[_T], does: str) -> _T | None:
-    named = getattr(command, option)
-    if named is None:
-        return None
-    return model_for(
-        option,
-        named,
-        protocol,
-        does,
-        download=command.download,
-        device=command.device,
-        report=command.observer.note,
     )
 
 
@@ -365,7 +350,6 @@ def _selection(flag: str, scene: Scene, name: str) -> Selection:
 def _facts(made: Selected, name: str, path: Path) -> dict[str, Any]:
     """What was made, for programs."""
     mean = made.selection.mean_confidence
-    hint = made.next_click
     return {
         "layer": name,
         "file": path,
@@ -374,13 +358,6 @@ def _facts(made: Selected, name: str, path: Path) -> dict[str, Any]:
         "confidence": None if mean is None else round(mean, 4),
         "source": made.source,
         "words": _word_facts(made),
-        "next_click": None
-        if hint is None
-        else {
-            "view": hint.view.name,
-            "point": [float(v) for v in hint.point],
-            "probability": round(float(hint.probability), 4),
-        },
         "warnings": list(made.warnings),
         "stage_seconds": {name: round(value, 4) for name, value in made.seconds.items()},
     }
@@ -400,14 +377,7 @@ def _lines(made: Selected) -> list[str]:
         f"{one['projected_views']} views"
         for one in _word_facts(made)
     ]
-    lines += [f"note: {warning}" for warning in made.warnings]
-    if (hint := made.next_click) is not None:
-        x, y = (float(v) for v in hint.point)
-        lines.append(
-            f"the next click helps most at --point {hint.view.name}:{x:.0f},{y:.0f}, or "
-            f"--negative where it is something else (now {100 * float(hint.probability):.0f} % in)"
-        )
-    return lines
+    return [*lines, *(f"note: {warning}" for warning in made.warnings)]
 
 
 def _word_facts(made: Selected) -> list[dict[str, Any]]:

@@ -135,7 +135,6 @@ class SeenPrompt:
         convert_fields(self)
         count = len(self.rows)
         check_shape("pixels", self.pixels, (count, 2))
-        check_shape("positive", self.positive, (count,))
         if self.inside is not None:
             check_shape("inside", self.inside, (self.view.camera.height, self.view.camera.width))
 

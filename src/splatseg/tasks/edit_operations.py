@@ -132,8 +132,8 @@ class EditOptions:
     them."""
 
     pictures: Natural = 3
-    """Number of views drawn before and after, those that change most, for reports/edit.html and
-    edit.png of the new scene. 0 draws none, and does not measure the change by the cut."""
+    """Number of views drawn before and after, those that change most, for reports/edit.html of the
+    new scene. 0 draws none, and does not measure the change by the cut."""
 
     def __post_init__(self) -> None:
         action = self._action()

@@ -93,7 +93,7 @@ class SeeOptions:
     """Which seeds count, and the order of the views."""
 
     overwrite: bool = False
-    """Replace evidence of this name, once the new one is complete."""
+    """Replace what an earlier run wrote under the same name."""
 
 
 @boundary

@@ -89,7 +89,7 @@ class SegmentOptions:
     from it, and stuff classes become one segment each: the layer is panoptic."""
 
     seed: int = 0
-    """Seed of random choices, recorded in the layer."""
+    """Seed of all random choices."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

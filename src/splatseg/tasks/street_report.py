@@ -34,11 +34,9 @@ from splatseg.report.street_report import (
 from splatseg.report.words import count_text, spread
 from splatseg.street.depth_views import capture_views, field_views
 from splatseg.street.field import VERTEX_WORDS
-from splatseg.street.geometry import enclosing
-from splatseg.street.shape_files import load_shapes
 from splatseg.tasks.scan_labels import LabelBy, ScanLabels
 from splatseg.tasks.street_drive import StreetDrive
-from splatseg.tasks.street_field import StreetField, depth_errors
+from splatseg.tasks.street_field import StreetField
 from splatseg.tasks.work import REPORTS_FOLDER, photographed, write_page
 
 _VIEWS = 4
@@ -153,16 +151,8 @@ def _making(made: StreetField | StreetDrive | None, scene: Scene) -> dict[str, A
         )
         for level, side in enumerate(mesh.sizes)
     )
-    before = start.mesh(load_shapes())
-    # Those around cameras are removed before the fit: they say nothing of shapes.
-    eyes = torch.stack([view.camera.centre for view in made.views])
-    around = enclosing(before, eyes)
-    if not bool(around.all()):
-        before = start.subset(~around).mesh(load_shapes())
-    errors = depth_errors(made.depths, before, mesh, metres_per_unit=metres)
     return told | {
         "levels": levels,
-        "depth": errors,
         "shaping": made.fit.geometry.records,
         "training": made.fit.radiance.records,
     }
