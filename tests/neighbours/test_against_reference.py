@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from splatseg.neighbours import NeighbourIndex, NeighbourLists, Neighbours, reference
+from splatseg.neighbours import NeighbourIndex, NeighbourLists, Neighbours
+from support import neighbours_reference as reference
 
 SHAPES = ("uniform", "lattice", "clusters", "line", "shells", "doubles")
 

@@ -438,8 +438,8 @@ class Subset:
 
     It takes its order from the index, so that making one costs a pass over the mask; the index is
     made once for a scene and kept. All answers are exact and do not depend on the number of
-    threads; `neighbours.reference` has their definitions. Radii include their border, as those of
-    `NeighbourIndex` do: :math:`d^2 \le r^2` in float64.
+    threads. Radii include their border, as those of `NeighbourIndex` do:
+    :math:`d^2 \le r^2` in float64.
 
     Args:
         index: An index of points with three columns, of float32 or a narrower type.

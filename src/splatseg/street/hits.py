@@ -20,12 +20,10 @@ from torch import Tensor
 
 from splatseg import _native
 from splatseg._check import check_choice, check_finite, check_range, check_shape
-from splatseg.core import Camera
 from splatseg.core.boundary import boundary
 from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError, RangeError
 from splatseg.raycast import RayHits
-from splatseg.street.depth_views import axis_cosines
 from splatseg.street.primitives import PrimitiveMesh
 from splatseg.street.shapes import FACES, VERTICES, template
 
@@ -263,37 +261,6 @@ class PrimitiveCaster:
             distances=hits.distances.gather(1, finest)[:, 0],
             weights=hits.weights.gather(1, finest[..., None].expand(-1, -1, 3))[:, 0].double(),
         )
-
-
-@boundary
-def mesh_distances(
-    mesh: PrimitiveMesh | PrimitiveCaster, camera: Camera
-) -> Float[Tensor, "height width"]:
-    """Distances from the camera's centre to the first hits of the pixels' rays, float32, 0 none.
-
-    Args:
-        mesh: The mesh, or the caster of a mesh that is looked at from several cameras.
-        camera: Its pixels.
-    """
-    caster = mesh if isinstance(mesh, PrimitiveCaster) else PrimitiveCaster(mesh)
-    origin, directions = camera.rays()
-    hits = caster.first(origin, directions.reshape(-1, 3))
-    found = torch.where(hits.faces >= 0, hits.distances, 0.0)
-    return found.view(camera.height, camera.width).float()
-
-
-@boundary
-def mesh_depth(
-    mesh: PrimitiveMesh | PrimitiveCaster, camera: Camera
-) -> Float[Tensor, "height width"]:
-    """z-depth of the first hits of the pixels' rays, scene units, float32, 0 where there is none.
-
-    Args:
-        mesh: The mesh, or the caster of a mesh that is looked at from several cameras.
-        camera: Its pixels.
-    """
-    _, directions = camera.rays()
-    return (mesh_distances(mesh, camera) * axis_cosines(camera, directions)).float()
 
 
 # Which primitives enclose a point: by the solid angle that their faces fill around it.

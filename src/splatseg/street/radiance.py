@@ -461,13 +461,3 @@ def ray_weights(
         weights.append(passed * one)
         passed = passed * (1 - one)
     return torch.stack(weights, dim=1), passed
-
-
-def composite(
-    opacity: Float[Tensor, "n hits"],
-    values: Float[Tensor, "n hits c"],
-    background: Float[Tensor, "n c"],
-) -> Float[Tensor, "n c"]:
-    """What rays show: values of samples, front to back, then the background."""
-    weights, passed = ray_weights(opacity)
-    return torch.einsum("nl,nlc->nc", weights, values) + passed[:, None] * background

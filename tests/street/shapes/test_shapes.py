@@ -15,14 +15,16 @@ from torch.nn import functional
 
 from splatseg.errors import FileFormatError, InputError, MissingFileError, RangeError, ShapeError
 from splatseg.io.tensors import write_tensors
-from splatseg.street.shape_files import SHIPPED, load_shapes, save_shapes
-from splatseg.street.shapes import ShapeAutoEncoder, ShapeConfig, new_shapes, sphere_code, template
+from splatseg.street.shape_files import SHIPPED, load_shapes
+from splatseg.street.shapes import ShapeAutoEncoder, ShapeConfig, sphere_code, template
 from splatseg_bench.worlds._recorded import surface_points
 from splatseg_bench.worlds._streets import street
 from splatseg_bench.worlds._varied_rooms import varied_room
 from support.shape_quality import (
     cut_patches,
     interpolate_codes,
+    new_shapes,
+    save_shapes,
     score_shapes,
     self_intersections,
     topology,
