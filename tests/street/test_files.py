@@ -87,7 +87,7 @@ def test_no_file_and_other_files(tmp_path: Path) -> None:
         load_mesh_field(tmp_path / "none.safetensors")
     other = tmp_path / "other.safetensors"
     write_tensors({"a": torch.zeros(2)}, other, metadata={})
-    with pytest.raises(FileFormatError, match="expected a mesh field, got None"):
+    with pytest.raises(FileFormatError, match="expected a mesh field, got none"):
         load_mesh_field(other)
     with pytest.raises(InputError, match=r"expected \.safetensors, got \.npz"):
         save_mesh_field(random_field(), tmp_path / "a.npz")

@@ -21,7 +21,6 @@ from torch import Tensor
 from splatseg import _native
 from splatseg._check import check_choice, check_finite, check_range, check_shape
 from splatseg.core.boundary import boundary
-from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError, RangeError
 from splatseg.raycast import RayHits
 from splatseg.street.primitives import PrimitiveMesh
@@ -148,18 +147,17 @@ class MeshCaster:
         faces = torch.empty(len(rays), width, dtype=torch.int64)
         distances = torch.empty(len(rays), width, dtype=torch.float64)
         weights = torch.empty(len(rays), width, 3)
-        with one_torch_thread():
-            for begin in range(0, len(rays), _RAYS):
-                part = slice(begin, begin + _RAYS)
-                own = starts if len(starts) == 1 else starts[part]
-                found = [
-                    level.hits(own, rays[part], limit, front=sides == "front")
-                    for level, limit in zip(self._levels, limits, strict=True)
-                    if limit
-                ]
-                merged = found[0] if len(found) == 1 else _merged(found, width)
-                faces[part], distances[part] = merged.faces, merged.distances
-                weights[part] = merged.weights
+        for begin in range(0, len(rays), _RAYS):
+            part = slice(begin, begin + _RAYS)
+            own = starts if len(starts) == 1 else starts[part]
+            found = [
+                level.hits(own, rays[part], limit, front=sides == "front")
+                for level, limit in zip(self._levels, limits, strict=True)
+                if limit
+            ]
+            merged = found[0] if len(found) == 1 else _merged(found, width)
+            faces[part], distances[part] = merged.faces, merged.distances
+            weights[part] = merged.weights
         return MeshHits(faces=faces, distances=distances, weights=weights)
 
 

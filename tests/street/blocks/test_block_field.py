@@ -388,7 +388,7 @@ def test_blocks_of_something_else_are_made_anew(change, tmp_path):
         ({"reach": None}, "reach: expected a number, got"),
         ({"start": "x"}, r"blocks\[0\]\.start: expected a number"),
         ({"end": -1}, "start, end: expected a piece"),
-        ({"piece": []}, r"blocks\[0\]\.piece: expected a list of length of at least 1"),
+        ({"piece": []}, r"blocks\[0\]\.piece: expected a list of length at least 1"),
         ({"span": [[0, 0]]}, r"blocks\[0\]\.span\[0\]: expected a list of length 3"),
         ({"span": [[0, 0, 1e99]]}, r"blocks\[0\]\.span\[0\]\[2\]: expected a finite number"),
     ],

@@ -391,7 +391,7 @@ def test_ours_come_back_as_they_were(tmp_path: Path) -> None:
     ("old", "new", "words"),
     [
         ('"version":"1"', '"version":"2"', "expected version 1 of splatseg.street.shapes, got '2'"),
-        (r"\"code_size\"", r"\"code_sizo\"", "expected facts and a config of code_size"),
+        (r"\"code_size\"", r"\"code_sizo\"", "expected shape"),
         (r"\"code_size\": 4", r"\"code_size\": 1", r"code_size: expected a value in \[2, 4096\]"),
         (r"\"code_size\": 4", r"\"code_size\": 5", "expected shape"),
         (r"\"code_size\": 4", r"\"code_size\":[]", "code_size"),

@@ -42,14 +42,25 @@ _LAYERS = re.compile(
 
 _SIDES = re.compile(
     r"image_size|feat\w*_(sizes|shape)|mask_size|max_(cond|object|position|text)|num_patches"
-    r"|num_queries|seq_len|context|n_ctx|kernel|stride|padding|patch|window|dilation|scales|roi"
+    r"|num_queries|seq_len|context|n_ctx"
 )
-"""Settings that say how large a picture, a step or a text is, by which memory is taken."""
+"""Settings that say how large a picture or a text is, by which memory is taken."""
 
-_REAL = re.compile(r"cost|coefficient|ratio|factors?$|temperature|max_depth")
+_STEPS = re.compile(
+    r"kernel|stride|padding|patch_|window|dilations|scales|roi_|downsample_rate|ratios"
+)
+"""Settings that say how far a layer looks or steps."""
+
+_ANY_SIGN = re.compile(
+    r"_id$|ind(ex|ic)|ignore|extract|blocks$|keep_alive|delay|thresh|area|scale$"
+)
+"""Settings of whole numbers that may be negative."""
+
+_REAL = re.compile(r"cost|coefficient|mlp_ratio|factors$|temperature|max_depth")
 """Settings that may be fractions though their defaults are whole."""
 
-_MOST_LAYERS, _LONGEST_SIDE, _LARGEST_WHOLE, _LARGEST_REAL = 200, 8192, 1 << 20, 1e9
+_MOST_LAYERS, _LONGEST_STEP, _LONGEST_SIDE = 200, 64, 8192
+_LARGEST_WHOLE, _LARGEST_REAL = 1 << 20, 1e9
 
 _SAM_PARTS = ("prompt_encoder", "mask_decoder")
 _SWIN = ("swin", "maskformer-swin", "resnet")
@@ -268,8 +279,12 @@ class _Checked:
             if math.fsum(cast("list[float]", flat)) > _MOST_LAYERS:
                 self._fail(name, f"a sum of at most {_MOST_LAYERS}", value)
         else:
-            limit = _LONGEST_SIDE if _SIDES.search(key) else _LARGEST_WHOLE
-            self._check_numbers(value, (-limit, limit), name, whole=default is not None)
+            bounds = (-_LARGEST_WHOLE if _ANY_SIGN.search(key) else 0, _LARGEST_WHOLE)
+            if _SIDES.search(key):
+                bounds = (-1, _LONGEST_SIDE)
+            elif _STEPS.search(key):
+                bounds = (0, _LONGEST_STEP)
+            self._check_numbers(value, bounds, name, whole=default is not None)
 
     def _flat(self, value: object, name: str) -> list[object]:
         flat = [value]
