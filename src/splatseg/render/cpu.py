@@ -3,8 +3,7 @@
 Results do not depend on the number of threads.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
 from typing import Any, ClassVar, cast
 
 import numpy as np
@@ -36,23 +35,6 @@ _LANES = 16
 _free_views: list[_native.View] = []
 _FREE_VIEWS = 4
 _INPUTS = ("means", "rotations", "scales", "opacities", "sh", "signal", "pose", "screen_offsets")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class SceneGradients:
-    """Gradients of one backward pass; rows of Gaussians that the view does not show are 0."""
-
-    means: Float[Tensor, "n 3"] | None
-    rotations: Float[Tensor, "n 4"] | None
-    scales: Float[Tensor, "n 3"] | None
-    opacities: Float[Tensor, "n"] | None
-    sh: Float[Tensor, "n coefficients 3"] | None
-    signal: Float[Tensor, "n channels"] | None
-    screen_offsets: Float[Tensor, "n 2"] | None
-    """With respect to the projected centres, per pixel, for densification."""
-
-    pose: Float[Tensor, "4 4"] | None
-    """Of ``cam_from_world``."""
 
 
 class CpuBackend(Backend):
@@ -292,57 +274,44 @@ class CpuView(BackendView):
     def backward(
         self,
         v_image: Float[Tensor, "height width channels"],
-        *,
-        v_alpha: Float[Tensor, "height width"] | None = None,
-        v_depth_sum: Float[Tensor, "height width"] | None = None,
-        wanted: frozenset[str] = frozenset(
-            ("means", "rotations", "scales", "opacities", "sh", "screen_offsets")
-        ),
-    ) -> SceneGradients:
+        v_alpha: Float[Tensor, "height width"],
+        v_depth_sum: Float[Tensor, "height width"] | None,
+        wanted: Collection[str],
+    ) -> dict[str, Tensor]:
         """Gradients of ``<v_image, image> + <v_alpha, alpha> + <v_depth_sum, depth_sum>``.
 
-        Needs a `draw` with ``record=True`` before it, of which it is the derivative.
+        Needs a `draw` with ``record=True`` before it, of which it is the derivative. Rows of
+        Gaussians that the view does not show are 0.
         """
         if self._forward is None:
             raise RuntimeError("backward: draw(record=True) comes first.")
-        image, alpha, depth_sum = self._forward
-        view = self._kernels()
-
-        def maybe(t: Tensor | None) -> Tensor | None:
-            return None if t is None else _plain(t)
-
-        n, channels = len(self._gaussians), image.shape[2]
-        v_signal = _zeros(n, channels) if "signal" in wanted else None
-        planes = (image, alpha, depth_sum, _plain(v_image), maybe(v_alpha), maybe(v_depth_sum))
+        v_depth = None if v_depth_sum is None else _plain(v_depth_sum)
+        planes = (*self._forward, _plain(v_image), _plain(v_alpha), v_depth)
+        view, n, channels = self._kernels(), len(self._gaussians), v_image.shape[2]
+        shapes: dict[str, tuple[int, ...]] = {
+            "means": (n, 3), "rotations": (n, 4), "scales": (n, 3), "opacities": (n,),
+            "screen_offsets": (n, 2), "signal": (n, channels),
+        }  # fmt: skip
+        if self._sh is not None and self._wide is None:
+            shapes["sh"] = tuple(self._sh.shape)
+        found = {name: _zeros(*shape) for name, shape in shapes.items() if name in wanted}
+        signal = found.get("signal")
         if self._wide is None:
             view.backward_colour(channels, *planes)
-            if v_signal is not None:
-                view.narrow_signal_gradient(channels, v_signal)
+            if signal is not None:
+                view.narrow_signal_gradient(channels, signal)
         else:
-            view.backward_features(self._wide, channels, *planes, v_signal)
-
-        def zeros(name: str, *shape: int) -> Tensor | None:
-            return _zeros(n, *shape) if name in wanted else None
-
-        use_sh = "sh" in wanted and self._sh is not None and self._wide is None
-        means, rotations, scales = zeros("means", 3), zeros("rotations", 4), zeros("scales", 3)
-        opacities, screen_offsets = zeros("opacities"), zeros("screen_offsets", 2)
-        sh = _zeros(*self._sh.shape) if use_sh and self._sh is not None else None
+            view.backward_features(self._wide, channels, *planes, signal)
         pose = torch.zeros(15, dtype=torch.float64) if "pose" in wanted else None
-        if any(
-            x is not None for x in (means, rotations, scales, opacities, sh, screen_offsets, pose)
-        ):
-            view.chain(self._cloud, means, rotations, scales, opacities, sh, screen_offsets, pose)
-        return SceneGradients(
-            means=means,
-            rotations=rotations,
-            scales=scales,
-            opacities=opacities,
-            sh=sh,
-            signal=v_signal,
-            screen_offsets=screen_offsets,
-            pose=None if pose is None else self._pose_gradient(pose),
-        )
+        if pose is not None or found.keys() - {"signal"}:
+            own = found.get
+            view.chain(
+                self._cloud, own("means"), own("rotations"), own("scales"), own("opacities"),
+                own("sh"), own("screen_offsets"), pose,
+            )  # fmt: skip
+        if pose is not None:
+            found["pose"] = self._pose_gradient(pose)
+        return found
 
     def _pose_gradient(self, sums: Tensor) -> Tensor:
         """From the rows of [R | t] and the camera centre c = -R^T t, where SH directions begin."""
@@ -375,17 +344,13 @@ class _Render(torch.autograd.Function):
         view = cast(CpuView, ctx.view)
         needs: tuple[bool, ...] = ctx.needs_input_grad
         v_image, v_alpha, v_depth_sum = v_outputs[:3]
-        found = view.backward(
-            v_image,
-            v_alpha=v_alpha,
-            v_depth_sum=v_depth_sum if bool(v_depth_sum.any()) else None,
-            wanted=frozenset(name for name, need in zip(_INPUTS, needs, strict=False) if need),
+        wanted = [name for name, need in zip(_INPUTS, needs, strict=False) if need]
+        v_depth_sum = v_depth_sum if bool(v_depth_sum.any()) else None
+        found = view.backward(v_image, v_alpha, v_depth_sum, wanted)
+        typed = (
+            found[name].to(dtype) if name in found else None
+            for name, dtype in zip(_INPUTS, ctx.dtypes, strict=True)
         )
-        gradients = (getattr(found, name) for name in _INPUTS)
-        typed = [
-            g.to(dtype) if need and g is not None else None
-            for g, dtype, need in zip(gradients, ctx.dtypes, needs, strict=False)
-        ]
         return (*typed, None, None, None)
 
 
