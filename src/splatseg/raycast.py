@@ -1,7 +1,6 @@
 """Where rays meet triangles first: Embree's search, and the point of a known triangle."""
 
 import contextlib
-import importlib
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -13,7 +12,7 @@ from torch import Tensor
 
 from splatseg._check import check_finite, check_shape
 from splatseg.core.boundary import boundary
-from splatseg.errors import InputError, MissingPackageError, RangeError, ShapeError
+from splatseg.errors import InputError, RangeError, ShapeError, import_package
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -194,14 +193,10 @@ def _rough_weights(found: Any, hit: Tensor) -> Tensor:
 
 
 def _scene(vertices: Tensor, faces: Tensor) -> Any:
-    try:
-        scenes = importlib.import_module("embreex.rtcore_scene")
-        meshes = importlib.import_module("embreex.mesh_construction")
-    except ImportError as error:
-        raise MissingPackageError(
-            "casting rays at meshes needs a package that is not installed (embreex). "
-            "Try: pip install 'splatseg[mesh]'."
-        ) from error
+    scenes, meshes = (
+        import_package(f"embreex.{part}", "casting rays at meshes", "mesh")
+        for part in ("rtcore_scene", "mesh_construction")
+    )
     scene = scenes.EmbreeScene(robust=True)
     # The corners of each triangle beside each other: indices of Embree have 32 bits.
     corners = vertices.float()[faces].contiguous().numpy()

@@ -450,7 +450,7 @@ def inner(world: World, by_type: dict[type, Any]) -> dict[str, Any]:
     from splatseg.io.export import objects_of
     from splatseg.lift import EvidenceSegments, UpliftOptions, uplift
     from splatseg.lift.training import AdamConstants, LabelTargets
-    from splatseg.methods import find_method, methods
+    from splatseg.methods import find_method
     from splatseg.models import find_model
     from splatseg.pose.doctor import Diagnosis, PointCorrection
     from splatseg.tasks import EditOptions, SegmentOptions, SharpenSceneOptions, segment
@@ -494,7 +494,6 @@ def inner(world: World, by_type: dict[type, Any]) -> dict[str, Any]:
         "methods.keeps_boundaries.method": "uplift",
         "methods.keeps_ids.method": "uplift",
         "methods.register_method.method": replace(method, name="own"),
-        "methods.methods_table.methods": methods(),
         "models.record_evidence.model": find_model("classical"),
         "models.record_evidence.folder": world.path(),
         "lift.MatchedMaps.source": EvidenceSegments(evidence=world.masks),

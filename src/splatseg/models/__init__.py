@@ -3,7 +3,6 @@
 Models see images and give evidence; they never see Gaussians. See ``docs/models.md``.
 """
 
-from splatseg.models._cache import ModelCache as ModelCache
 from splatseg.models._record import EvidenceRequest as EvidenceRequest
 from splatseg.models._record import SeenEvidence as SeenEvidence
 from splatseg.models._record import record_evidence as record_evidence

@@ -36,7 +36,6 @@ from splatseg.io.evidence import (
     view_files,
 )
 from splatseg.io.json_files import json_text, parse_object
-from splatseg.models._cache import ModelCache
 from splatseg.models._tracked import TrackingEvidence, TrackingOptions
 from splatseg.models._weights import What
 from splatseg.models._written import (
@@ -76,9 +75,6 @@ class EvidenceRequest:
 
     allow_missing: bool = False
     """Take the views that recorded evidence has, where some are missing."""
-
-    cache: ModelCache | None = None
-    """Where to look before the model is run."""
 
     seeds: Evidence | None = None
     """Objects that a tracker follows: evidence of masks, panoptic segments, labels or tracks.
@@ -212,8 +208,6 @@ def _writers(
     ]:
         if len(questions) > 1:
             raise InputError("what: expected tracked alone, since views come in its order.")
-        if request.cache is not None:
-            raise InputError("cache: keeps answers to single photographs, got a tracker's.")
         options = request.tracking or TrackingOptions()
         tracker = cast(MaskTracker, model)
         return [
@@ -226,10 +220,7 @@ def _writers(
     if isinstance(model, RecordedModel):
         missing = request.allow_missing
         return [CopiedEvidence(model, views, one, allow_missing=missing) for one in questions]
-    return [
-        ComputedEvidence(model, views, one, cache=request.cache, pictures=pictures)
-        for one in questions
-    ]
+    return [ComputedEvidence(model, views, one, pictures=pictures) for one in questions]
 
 
 def _check_apart(target: Path, reads: Path | None) -> None:

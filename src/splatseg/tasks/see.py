@@ -28,7 +28,6 @@ from splatseg.io.scene_folder import scene_path, work_on_scene
 from splatseg.models import (
     EvidenceRequest,
     LoadOptions,
-    ModelCache,
     SeenEvidence,
     TrackingOptions,
     What,
@@ -45,7 +44,10 @@ T = TypeVar("T")
 
 
 @options(
-    removed={"precision": "features are cached in float16; a cache of an earlier version is read"}
+    removed={
+        "cache": "`see --model FOLDER` copies evidence that another scene of the photographs has",
+        "precision": "nothing is cached; evidence has features in float16",
+    }
 )
 class SeeOptions:
     """What a model predicts, of which views, and what is kept."""
@@ -80,10 +82,6 @@ class SeeOptions:
     depth_unit: float | None = None
     """Metres of one step of recorded depth maps that are pictures or .npy files, such as 0.001.
     None: they hold inverse depth up to scale and shift."""
-
-    cache: Path | None = None
-    """Folder that keeps the model's answers by the content of the photographs, for other scenes
-    with the same photographs."""
 
     seeds: str | None = None
     """Evidence that says what a tracker follows: masks, panoptic segments, labels or tracks of
@@ -143,9 +141,6 @@ def see(
     found = _model(model, options, model_options, loading, observer, views=scene.views)
     seeds = None if options.seeds is None else work.evidence(options.seeds)
     tracking = None if seeds is None and options.tracking == TrackingOptions() else options.tracking
-    cache = (
-        None if options.cache is None else ModelCache(folder=options.cache, report=observer.note)
-    )
     if found.note:
         observer.note(f"{found.name}: {found.note}")
     folder = scene_path(root, EVIDENCE_FOLDER, evidence)
@@ -160,7 +155,6 @@ def see(
                 view_spec=view_spec(options.views),
                 overwrite=options.overwrite,
                 allow_missing=options.allow_missing,
-                cache=cache,
                 seeds=seeds,
                 tracking=tracking,
                 image_of=images,
@@ -177,8 +171,6 @@ def see(
         seen = replace(seen, notes=(*seen.notes, note))
     for note in seen.notes:
         observer.note(note)
-    if cache is not None:
-        observer.note(f"{cache.folder}: {cache.size()}")
     return seen
 
 

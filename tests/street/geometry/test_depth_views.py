@@ -21,11 +21,12 @@ from splatseg.street.depth_views import (
     point_views,
     scan_views,
 )
-from splatseg.street.hits import PrimitiveCaster, enclosing, mesh_depth, mesh_distances
+from splatseg.street.hits import PrimitiveCaster, enclosing
 from splatseg.street.primitives import PrimitiveMesh
 from splatseg.street.shapes import template
 from support import brute_rays as reference
 from support.analytic import BallOverFloor
+from support.mesh_fields import mesh_depth, mesh_distances
 
 
 def camera(width: int = 3, height: int = 1, *, x: float = 0.0) -> Camera:
