@@ -101,7 +101,7 @@ class Bench:
         options = SelectOptions(**(_fields(self.options) | changes)) if changes else None
         began = time.perf_counter()
         try:
-            found = self.session.select(prompts, options=options)
+            found = self.session.select(prompts, options=options, advise=False)
         except InputError:
             return Selection(mask=torch.zeros(len(self.scene.gaussians), dtype=torch.bool))
         self.seconds.append(time.perf_counter() - began)
@@ -165,6 +165,27 @@ class Bench:
         ids = uplift(self.scene.gaussians, self.scene.train_views, maps).ids
         return lambda target: Selection(mask=ids == target.id + 1)
 
+    def asked(self, target: ClickTarget, clicks: int) -> Selection:
+        """By clicks where the selection asks for them."""
+        prompts = [_point(target.view, target.point)]
+        for _ in range(clicks - 1):
+            try:
+                found = self.session.select(prompts, advise=True)
+            except InputError:
+                break
+            hint = found.next_click
+            if hint is None:
+                break
+            x, y = (float(v) for v in hint.point)
+            sign = self.targets.truth(hint.view)[int(y), int(x)] == target.id
+            more = [*prompts, _point(hint.view, (x, y), positive=bool(sign))]
+            try:
+                self.session.select(more, advise=False)
+            except InputError:
+                break
+            prompts = more
+        return self.select(prompts)
+
     def robot(self, target: ClickTarget) -> list[float]:
         """IoU on test views after each click of a robot that sees the truth of train views."""
         prompts = [_point(target.view, target.point)]
@@ -208,6 +229,7 @@ def rows_of(bench: Bench) -> dict[str, Callable[[ClickTarget], Selection]]:
         **{f"noisy{draw}": partial(bench.noisy, draw=draw) for draw in range(1, NOISY_CLICKS)},
         "scribble": bench.scribble,
         "box": bench.box,
+        "clicks3": lambda target: bench.asked(target, 3),
         "mask": bench.mask,
         "recorded": bench.recorded,
         "sam": lambda target: bench.recorded(target, at_click=True),

@@ -27,6 +27,7 @@ from splatseg.io.evidence import open_evidence
 from splatseg.io.scene import load_scene
 from splatseg.lift import uplift
 from splatseg.prompting.graph import NeighbourGraph, build_graph, graph_cut, holes, specks
+from splatseg.prompting.next_click import next_click
 from splatseg.render.cpu import set_threads
 
 SIZES = range(300, 20_001)
@@ -92,6 +93,10 @@ def main() -> None:
         clean, ms = timed(lambda s=filled: s - specks(graph, s))
         found["ms specks"].append(ms)
         found["iou clean"].append(overlap(clean.mask, truth))
+        if len(sizes) % 8 == 1:
+            unsure = refined
+            _, ms = timed(lambda p=unsure: next_click(gaussians, views, p))
+            found["ms next click"].append(ms)
     nearest = min(range(len(sizes)), key=lambda i: abs(sizes[i] - 7000))
     print(f"{len(sizes)} objects; the one in brackets has {sizes[nearest]} Gaussians")
     for name, values in found.items():

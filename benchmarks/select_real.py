@@ -1,4 +1,4 @@
-"""The object of a real capture by a click, a box, a stroke or a mask in one view.
+"""The object of a real capture by a click, clicks, a box, a stroke or a mask in one view.
 
     python benchmarks/select_real.py SCENE ../shared/data/real/dtu_scan37/masks --evidence masks
 
@@ -9,7 +9,8 @@ does it, and scored by ../shared/score/score.py: mean IoU over these views, then
 were asked in. Rows:
 
 - `click`: one click at the pixel of the mask farthest from its rim; `group`, `part`: the same with
-  that granularity; `robotN`: clicks at the middle of the largest error in ten views.
+  that granularity; `clicksN`: N clicks, all but the first where the selection asks for the next
+  one, answered by the mask there; `robotN`: clicks at the middle of the largest error in ten views.
 - `mask`, `box`, `scribble`: the mask of the view, its box, a stroke through its middle.
 - `background`: all but what one click on what the object is not selects.
 - `lift`: the mask of the view, projected alone: each Gaussian of which it shows most inside.
@@ -72,6 +73,8 @@ class Asker:
     def answer(self, row: str, view: View) -> Selection:
         """What a row selects, asked in a view."""
         mask = self.truth(view)
+        if row.startswith("clicks"):
+            return self._asked(view, int(row.removeprefix("clicks")))
         if row.startswith("robot"):
             return self._corrected(view, int(row.removeprefix("robot")))
         match row:
@@ -100,7 +103,21 @@ class Asker:
     def _select(self, prompts: Sequence[ViewPrompt], **changes: Any) -> Selection:
         own = {name: getattr(self._options, name) for name in SelectOptions.__dataclass_fields__}
         options = SelectOptions(**(own | changes))
-        return self._session.select(prompts, options=options).selection
+        return self._session.select(prompts, options=options, advise=False).selection
+
+    def _asked(self, view: View, count: int) -> Selection:
+        """By clicks where the selection asks for them."""
+        prompts = [_click(view, _middle(self.truth(view)))]
+        for _ in range(count - 1):
+            hint = self._session.select(prompts, advise=True).next_click
+            if hint is None:
+                break
+            x, y = (float(v) for v in hint.point)
+            more = [*prompts, _click(hint.view, (x, y), self.truth(hint.view)[int(y), int(x)])]
+            if not self._answered(more):
+                break
+            prompts = more
+        return self._select(prompts)
 
     def _corrected(self, view: View, count: int) -> Selection:
         """By clicks at the middle of the largest error that a few train views show."""
@@ -230,7 +247,7 @@ def main() -> None:
     parser.add_argument("--layer")
     parser.add_argument("--evidence")
     parser.add_argument("--record", help="name under which true masks become evidence")
-    parser.add_argument("--rows", nargs="+", default=["click", "group", "mask", "box"])
+    parser.add_argument("--rows", nargs="+", default=["click", "group", "clicks3", "mask", "box"])
     parser.add_argument("--views", type=int, default=3, help="training views that are asked in")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--work", type=Path, default=Path(tempfile.gettempdir()))

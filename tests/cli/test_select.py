@@ -43,6 +43,7 @@ def test_a_click_becomes_a_layer(room, splatseg) -> None:
     assert facts["selected"] == load_scene_layer(room.scene, "red").count
     assert facts["confidence"] == 1
     assert facts["source"] == "layer"
+    assert facts["next_click"] is None
     assert set(facts["stage_seconds"]) >= {"see", "layer"}
     assert "confidence 1.00" in splatseg("info", room.scene)[1]
 

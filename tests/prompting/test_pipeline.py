@@ -20,6 +20,7 @@ from splatseg.prompting.pipeline import (
     grown,
     growth_radius,
     neighbour_count,
+    next_click,
     postprocess,
     refined,
     region_grow,
@@ -154,13 +155,14 @@ def test_ball_growing_by_hand() -> None:
 # Steps
 
 
-def shown(gaussians, view, source: str, *, unseen=None, **fields) -> SelectionContext:
+def shown(gaussians, view, source: str, *, unseen=None, views=(), **fields) -> SelectionContext:
     prompt = ViewPrompt(view=view, **(fields or {"points": torch.tensor([[10.5, 15.5]])}))
     return SelectionContext(
         gaussians=gaussians,
         prompts=see_prompts(gaussians, [prompt]),
         views=ViewCache(gaussians),
         neighbours=SceneIndex(gaussians),
+        scene_views=tuple(views),
         source=source,
         unseen=unseen,
     )
@@ -274,3 +276,12 @@ def test_what_no_view_showed_takes_the_side_around_it(gaussians, view, field) ->
     inner = gaussians.means[:, 0] < -0.3
     inner &= gaussians.means[:, 1] < 0.8
     assert (found[unseen & inner] > 0.5).all()
+
+
+def test_the_next_click_is_where_it_is_uncertain(gaussians, view, field) -> None:
+    x, _, _ = gaussians.means.unbind(1)
+    doubt = torch.where((x > 0.4) & (x < 1.2), 0.5, field)
+    assert next_click(doubt, shown(gaussians, view, "layer")) is None, "no view to click in"
+    click = next_click(doubt, shown(gaussians, view, "layer", views=[view]))
+    assert click is not None
+    assert 24 < click.point[0] < 33

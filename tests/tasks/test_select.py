@@ -51,6 +51,7 @@ def test_a_click_selects_what_the_layer_has_there(world) -> None:
     assert made.source == "layer"
     assert set(made.seconds) >= {"open", "see", "layer"}
     assert made.warnings == ()
+    assert made.next_click is None
     info = made.selection.info
     assert (info.method, info.views, info.seed) == ("select", ("front",), 0)
     assert info.options["layer"] == "fields"
@@ -215,3 +216,13 @@ def test_a_session_opens_its_source_once_and_keeps_nothing_else(world) -> None:
             session.select(world.click(IN_1), options=SelectOptions(from_layer="x"))
         with pytest.raises(InputError, match="open another session"):
             session.select(world.click(IN_1), options=SelectOptions(evidence="x"))
+
+
+def test_who_advises_is_asked_with_the_final_confidence(world, monkeypatch) -> None:
+    heard = []
+    module = importlib.import_module("splatseg.tasks.select")
+    monkeypatch.setattr(module, "next_click", lambda c, context: heard.append((c, context)))
+    made = world.select(world.click(IN_1), advise=True)
+    ((confidence, context),) = heard
+    assert torch.equal(confidence, made.selection.confidence)
+    assert [view.name for view in context.scene_views] == ["front", "side"]

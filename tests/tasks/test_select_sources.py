@@ -199,8 +199,10 @@ def test_a_scene_without_anything_says_what_to_make(room) -> None:
 def test_features_of_the_scene_folder_are_found(room) -> None:
     scene = load_scene(room)
     save_scene_layer(affinity(len(scene.gaussians)), room, "affinity")
-    made = select(load_scene(room), click(scene))
+    made = select(load_scene(room), click(scene), advise=True)
     assert (made.source, made.selection.info.options["layer"]) == ("features", "affinity")
+    assert "next_click" in made.seconds
+    assert "next_click" not in select(load_scene(room), click(scene)).seconds
 
 
 def test_features_trained_as_published_are_asked_as_published(room) -> None:

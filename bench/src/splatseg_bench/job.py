@@ -274,7 +274,7 @@ class LayerSelector:
         """
         if self._session is None:
             self._session = self._opened(layer)
-        return self._session.select(prompt).selection
+        return self._session.select(prompt, advise=False).selection
 
     def _opened(self, layer: Layer) -> SelectionSession:
         switches = self._job.protocol.switches

@@ -32,10 +32,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from splatseg._check import check_values
-from splatseg.core import Gaussians, LabelMap, Selection
+from splatseg.core import Gaussians, LabelMap, Selection, View
 from splatseg.errors import InputError, ShapeError
 from splatseg.lift.voting.segment_masses import view_masses
 from splatseg.neighbours import NeighbourIndex, Subset
+from splatseg.prompting import next_click as _clicks
 from splatseg.prompting.graph import (
     NeighbourGraph,
     build_graph,
@@ -44,6 +45,7 @@ from splatseg.prompting.graph import (
     holes,
     specks,
 )
+from splatseg.prompting.next_click import NextClick
 from splatseg.prompting.seen import SeenPrompt, ViewCache
 
 MAX_NEIGHBOURS = 32
@@ -156,6 +158,9 @@ class SelectionContext:
 
     neighbours: SceneIndex
     """Their neighbours."""
+
+    scene_views: tuple[View, ...] = ()
+    """Training views, in which a next click may be asked for."""
 
     source: str = ""
     """What the confidences come from: features, masks, layer, or another name."""
@@ -400,6 +405,20 @@ def postprocess(
             confidence = step(confidence, context)
             seconds[name] = time.perf_counter() - began
     return confidence, seconds
+
+
+def next_click(confidence: Float[Tensor, "n"], context: SelectionContext) -> NextClick | None:
+    """Where a click would settle most; None where nothing is uncertain."""
+    if not context.scene_views:
+        return None
+    return _clicks.next_click(
+        context.gaussians,
+        context.scene_views,
+        confidence,
+        clicked=context.pointed_at(positive=True),
+        rejected=context.pointed_at(positive=False),
+        backend=context.views.backend,
+    )
 
 
 def checked_membership(

@@ -22,6 +22,7 @@ from splatseg.core import (
 from splatseg.core.boundary import boundary
 from splatseg.core.models import Image, Prompt
 from splatseg.errors import InputError, ShapeError
+from splatseg.prompting.next_click import NextClick
 from splatseg.prompting.pipeline import (
     MembershipSource,
     SceneIndex,
@@ -29,6 +30,7 @@ from splatseg.prompting.pipeline import (
     SimilaritySource,
     StepName,
     checked_membership,
+    next_click,
     postprocess,
 )
 from splatseg.prompting.prompts import (
@@ -69,6 +71,9 @@ class Selected:
 
     source: str
     """What said which Gaussians belong together; empty where places alone did."""
+
+    next_click: NextClick | None = None
+    """Where one more click would help most; None where nobody asked, or nothing is uncertain."""
 
     warnings: tuple[str, ...] = ()
     """What should be known of it, in sentences."""
@@ -152,6 +157,7 @@ class SelectionSession:
         *,
         base: Selection | None = None,
         options: SelectOptions | None = None,
+        advise: bool = False,
     ) -> Selected:
         """See `splatseg.tasks.select`.
 
@@ -159,6 +165,7 @@ class SelectionSession:
             prompts: What to select by.
             base: A selection that this one adds to, is subtracted from or intersected with.
             options: Instead of the session's; they may not ask for another source.
+            advise: Whether to look for where the next click would help most.
 
         Raises:
             InputError: If the options ask for another source than the session has.
@@ -186,10 +193,16 @@ class SelectionSession:
             seconds |= steps
         confidence = within(confidence, solids, self._work.gaussians)
         selection = self._described(confidence, requested, base, options)
+        hint = None
+        if advise and shown and selection.confidence is not None:
+            began = time.perf_counter()
+            hint = next_click(selection.confidence, context)
+            seconds["next_click"] = time.perf_counter() - began
         return Selected(
             selection=selection,
             seconds=seconds,
             source=context.source,
+            next_click=hint,
             warnings=() if selection.count else ("Nothing is selected.",),
             made_layers=self.made_layers,
         )
@@ -236,6 +249,7 @@ class SelectionSession:
             views=self._views,
             neighbours=self._neighbours,
             unseen=None if self._opened is None else getattr(self._opened.source, "unseen", None),
+            scene_views=self._work.scene.train_views,
             source="" if self._opened is None else self._opened.name,
             published=published,
             granularity=options.level,
@@ -344,6 +358,7 @@ def select(
     source: MembershipSource | None = None,
     prompter: PromptableMasks | None = None,
     base: Selection | None = None,
+    advise: bool = False,
     layers: Mapping[str, Layer] | None = None,
     backend: BackendName = "auto",
     observer: Observer = SILENT,
@@ -363,6 +378,8 @@ def select(
         source: Says which Gaussians belong together; None opens what `options` ask for.
         prompter: Turns points and boxes into masks of their views, such as SAM; None leaves them.
         base: A selection that `SelectOptions.mode` adds to, subtracts from or intersects with.
+        advise: Whether to look for where the next click would help most. Followed on measured
+            scenes, the advice does not raise the IoU (docs/selecting.md).
         layers: Layers at hand; others are read from the scene's folder.
         backend: Rendering backend.
         observer: Is told of what is opened.
@@ -384,7 +401,7 @@ def select(
         backend=backend,
         observer=observer,
     ) as session:
-        return session.select(prompts, base=base)
+        return session.select(prompts, base=base, advise=advise)
 
 
 def _as_prompts(
