@@ -193,10 +193,8 @@ def _rough_weights(found: Any, hit: Tensor) -> Tensor:
 
 
 def _scene(vertices: Tensor, faces: Tensor) -> Any:
-    scenes, meshes = (
-        import_package(f"embreex.{part}", "casting rays at meshes", "mesh")
-        for part in ("rtcore_scene", "mesh_construction")
-    )
+    scenes = import_package("embreex.rtcore_scene", "casting rays at meshes", "mesh")
+    meshes = import_package("embreex.mesh_construction", "casting rays at meshes", "mesh")
     scene = scenes.EmbreeScene(robust=True)
     # The corners of each triangle beside each other: indices of Embree have 32 bits.
     corners = vertices.float()[faces].contiguous().numpy()

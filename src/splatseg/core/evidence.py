@@ -334,7 +334,7 @@ class Track:
 
 @boundary
 def map_ids(
-    ids: Int[Tensor, "height width"],
+    ids: Int[Tensor, "..."],
     values: Mapping[int, float],
     *,
     default: float | None,

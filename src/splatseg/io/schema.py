@@ -157,21 +157,25 @@ def _with_whole_numbers(value: Any) -> Any:
 
 
 @functools.cache
-def _numbers_in(kind: Any) -> Any:
+def _numbers_in(kind: Any, within: tuple[Any, ...] = ()) -> Any:
     """Where a type has numbers that must be finite; None where it has none.
 
     `float`, the types of fields by name, (class, type) of members of a union, or the type of items.
+    A class that is among those it is within, as a field of itself, counts as having some.
     """
     origin, args = typing.get_origin(kind), typing.get_args(kind)
     if kind is float:
         return float
     if origin is Annotated:
         free = any(m.extra and m.extra.get("infinite") for m in args[1:] if hasattr(m, "extra"))
-        return None if free else _numbers_in(args[0])
+        return None if free else _numbers_in(args[0], within)
     if isinstance(kind, type) and is_dataclass(kind):
+        if kind in within:
+            return kind
         hints = typing.get_type_hints(kind, include_extras=True)
-        return {name: hint for name, hint in hints.items() if _numbers_in(hint)} or None
-    inner = [arg for arg in args if _numbers_in(arg)]
+        within = (*within, kind)
+        return {name: hint for name, hint in hints.items() if _numbers_in(hint, within)} or None
+    inner = [arg for arg in args if _numbers_in(arg, within)]
     if origin not in (Union, types.UnionType):
         return tuple(inner[:1]) or None
     plain = ((typing.get_args(m)[0] if typing.get_origin(m) is Annotated else m) for m in inner)

@@ -17,7 +17,14 @@ import torch
 import support
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.models import LoadOptions, find_model
-from splatseg.models.networks._config import checked_config, library_config, offline
+from splatseg.models.networks._config import (
+    FLAGS,
+    NUMBERS,
+    WORDS,
+    checked_config,
+    library_config,
+    offline,
+)
 from splatseg.models.networks._library import side_of
 from support.networks import IMAGE, KINDS, asked, checkpoint, in_parts
 
@@ -66,6 +73,7 @@ def load(folder: Path, family: str = "dinov2") -> object:
         ({"out_features": ["../../a"]}, "out_features: expected a word"),
         ({"id2label": {"x": "a"}}, "id2label: expected a name by the number"),
         ({"id2label": {"0": "a\0"}}, "config.json: id2label: 0: expected text that UTF-8 can hold"),
+        ({"eos_token_id": [1, 2]}, "eos_token_id: expected the number of one token"),
         ({"id2label": {str(i): "a" for i in range(70_000)}}, "names of 1 to 65535 classes"),
         ({"num_labels": 10**9}, "num_labels: expected a whole number from 1 to 65535"),
         ({"hidden_size": 1 << 16, "mlp_ratio": 8}, "expected a network of the size of its weights"),
@@ -96,14 +104,14 @@ def test_parts_are_looked_at_too(changed) -> None:
         load(changed("segformer", depths=[60, 60, 60, 60]), "segformer")
 
 
-def test_a_token_is_one_number(changed) -> None:
-    folder = changed("clip", text_config__eos_token_id=[1, 2])
-    with pytest.raises(FileFormatError, match="eos_token_id: expected the number of one token"):
-        load(folder, "clip")
-
-
-def test_what_the_library_does_not_know_is_left_out(changed) -> None:
-    load(changed("dinov2", layerscale_value=0.5, nobody_knows={"a": 3}))
+def test_settings_of_a_later_library_are_not_left_out_in_silence(changed, monkeypatch) -> None:
+    known = dict(NUMBERS)
+    del known["layerscale_value"]
+    monkeypatch.setattr("splatseg.models.networks._config.NUMBERS", known)
+    folder = changed("dinov2", layerscale_value=1.0, nobody_knows=3)
+    load(folder)  # the default, and what the library does not know either
+    with pytest.raises(FileFormatError, match="layerscale_value: expected no such setting"):
+        load(changed("dinov2", layerscale_value=0.5))
 
 
 def test_sizes_that_leave_nothing_of_an_image(changed) -> None:
@@ -131,6 +139,11 @@ def test_what_is_said_reaches_the_library(changed) -> None:
     assert (config.layerscale_value, config.hidden_dropout_prob) == (0.25, 0.5)
     with pytest.raises(FileFormatError, match="expected a configuration of Dinov2With"):
         load(changed("dinov2_with_registers", mlp_ratio=None))
+
+
+def test_no_key_is_of_two_kinds() -> None:
+    names = [*NUMBERS, *FLAGS, *WORDS]
+    assert len(names) == len(set(names))
 
 
 @pytest.mark.parametrize("name", KINDS)
@@ -298,7 +311,7 @@ def test_an_adapter_is_no_network(checkpoints, tmp_path) -> None:
     [
         ("dinov3", "dinov3", {"image_size": 0}, "expected sides in pixels, got 0"),
         ("clipseg", "clipseg", {"extract_layers": [0, 77]}, r"some of \d+ blocks, got \[0, 77\]"),
-        ("clipseg", "clipseg", {"extract_layers": [-1]}, "a whole number from 0 to 200, got -1"),
+        ("clipseg", "clipseg", {"extract_layers": [-1]}, r"some of \d+ blocks, got \[-1\]"),
     ],
 )
 def test_sizes_that_are_none(changed, family, kind, values, words) -> None:

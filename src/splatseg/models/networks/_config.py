@@ -1,10 +1,11 @@
 """config.json of weights, held against what the network's own may say, before any library sees it.
 
 The file comes with the weights, from anywhere, and transformers does what it says: it fetches and
-runs kernels and networks by name, imports packages, and builds layers without end. So what may
-stand in it are the settings of the configuration classes of transformers: numbers, flags and words
-as their defaults are, within bounds that their names tell, and the parts that a network has.
-Everything else is refused, or left out where it changes no answer.
+runs kernels and networks by name, imports packages, and builds layers without end. So tables here
+have what may stand in it: keys, what their values are, and which parts a network has; everything
+else is refused, or left out where it changes no answer. The names are those of the configuration
+classes of transformers 5. Keys of training alone (weights of losses, dropout) are there too: the
+library checks their types, and networks that run do not look at them.
 """
 
 import importlib
@@ -15,6 +16,7 @@ import tempfile
 import threading
 from collections.abc import Generator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn, cast
 
@@ -23,44 +25,134 @@ from splatseg.errors import FileFormatError, quoted
 from splatseg.io.foreign import made_from, reading
 from splatseg.io.json_files import read_json
 
-_MORE = ("out_features", "out_indices", "rope_type", "type")
-"""Keys that are taken although they are no setting by themselves."""
 
-_WORDS = frozenset({
-    "absolute", "add", "axial", "basic", "bottleneck", "default", "gelu", "gelu_fast", "gelu_new",
-    "gelu_pytorch_tanh", "GN", "ignore", "learned", "leaky_relu", "metric", "mish", "preactivation",
-    "project", "quick_gelu", "relative", "relu", "relu2", "relu6", "same", "SAME", "sigmoid",
-    "silu", "sine", "swish", "tanh", "valid", "VALID",
-})  # fmt: skip
-"""What text may say; names of stages are words too."""
+@dataclass(frozen=True, slots=True)
+class Numbers:
+    """A number, or a list of such numbers."""
 
-_LAYERS = re.compile(
-    r"(layers?|convs|stages|n_points|depths?|levels|blocks|maskmem|point_embeddings|tokens)$"
-    r"|blocks_per_stage|num_multimask|width_factor"
-)
-"""Settings that say how often something is built: at most `_MOST_LAYERS` together."""
+    low: float
+    high: float
+    whole: bool = True
+    sum_at_most: float | None = None
+    """Of all numbers of a list together."""
 
-_SIDES = re.compile(
-    r"image_size|feat\w*_(sizes|shape)|mask_size|max_(cond|object|position|text)|num_patches"
-    r"|num_queries|seq_len|context|n_ctx"
-)
-"""Settings that say how large a picture or a text is, by which memory is taken."""
 
-_STEPS = re.compile(
-    r"kernel|stride|padding|patch_|window|dilations|scales|roi_|downsample_rate|ratios"
-)
-"""Settings that say how far a layer looks or steps."""
+_LAYERS = """
+    auxiliary_num_convs blocks_per_stage conditional_layer decoder_layers decoder_n_points depths
+    encoder_layers encoder_n_points fpn_top_down_levels iou_head_depth memory_attention_num_layers
+    memory_fuser_num_layers num_blocks num_encoder_blocks num_feature_levels num_hidden_layers
+    num_layers num_maskmem num_multimask_outputs num_point_embeddings num_query_pool_stages
+    num_register_tokens num_stages num_upsampling_stages num_upscale_blocks query_dec_layers
+    text_encoder_num_layers text_encoder_proj_layers width_factor
+"""
+_STEPS = """
+    attention_downsample_rate common_stride dilations encoder_stride feature_strides
+    fpn_kernel_size fpn_padding fpn_stride kernel_size mask_downsampler_kernel_size
+    mask_downsampler_padding mask_downsampler_stride mask_downsampler_total_stride
+    memory_attention_downsample_rate memory_fuser_kernel_size memory_fuser_padding output_stride
+    patch_kernel_size patch_padding patch_size patch_sizes patch_stride pool_scales
+    pretrained_window_sizes query_stride roi_size sr_ratios strides
+    window_positional_embedding_background_size window_size window_size_per_stage
+"""
+_SIDES = """
+    backbone_feature_sizes backbone_featmap_shape image_size low_res_mask_size max_cond_frame_num
+    max_object_pointers_in_encoder max_position_embeddings max_text_len
+    memory_attention_rope_feat_sizes num_patches num_queries pretrain_image_size task_seq_len
+    text_encoder_context_length text_encoder_n_ctx
+"""
+_SIZES = """
+    auxiliary_channels backbone_channel_list conv_dim d_model decoder_attention_heads
+    decoder_ffn_dim decoder_hidden_size decoder_intermediate_size decoder_num_attention_heads
+    dim_feedforward embed_dim embed_dim_per_stage embedding_size encoder_attention_heads
+    encoder_feedforward_dim encoder_ffn_dim feature_size fpn_feature_size fpn_hidden_size
+    fusion_hidden_size head_hidden_size hidden_dim hidden_size hidden_sizes intermediate_size
+    iou_head_hidden_dim mask_dim mask_downsampler_embed_dim mask_feature_size mask_input_channels
+    memory_attention_feed_forward_hidden_size memory_attention_hidden_size
+    memory_attention_num_attention_heads memory_encoder_hidden_size
+    memory_encoder_output_channels memory_fuser_embed_dim memory_fuser_intermediate_dim mlp_dim
+    neck_hidden_sizes num_attention_heads num_attention_heads_per_stage num_channels num_groups
+    num_heads num_key_value_heads num_pos_feats output_channels pooler_output_size projection_dim
+    projection_size query_dim reassemble_hidden_size reduce_dim text_encoder_vocab_size
+    text_encoder_width type_vocab_size vit_dim vocab_size
+"""
+_WHOLE = """
+    _out_indices backbone_out_indices bos_token_id eos_token_id extract_layers fill_hole_area
+    global_attention_blocks global_attn_indexes head_in_index hotstart_delay hotstart_dup_thresh
+    hotstart_unmatch_thresh ignore_index ignore_value init_trk_keep_alive max_num_objects
+    max_trk_keep_alive min_trk_keep_alive multimask_max_pt_num multimask_min_pt_num
+    neck_ignore_stages out_indices pad_token_id recondition_every_nth_frame scale
+    semantic_loss_ignore_index sep_token_id train_num_points
+"""
+_REAL = """
+    activation_dropout assoc_iou_thresh attention_dropout attention_probs_dropout_prob
+    auxiliary_loss_weight bbox_cost bbox_loss_coefficient class_cost class_loss_coefficient
+    class_weight classifier_dropout classifier_dropout_prob contrastive_temperature
+    contrastive_weight cross_entropy_weight decoder_attention_dropout decoder_layerdrop
+    det_nms_thresh dice_cost dice_loss_coefficient dice_weight drop_path_rate dropout
+    dynamic_multimask_stability_delta dynamic_multimask_stability_thresh encoder_layerdrop
+    eos_coefficient focal_alpha fusion_dropout fusion_droppath giou_cost giou_loss_coefficient
+    high_conf_thresh high_iou_thresh hidden_dropout hidden_dropout_prob importance_sample_ratio
+    init_std init_xavier_std initializer_factor initializer_range layer_norm_eps
+    layer_scale_init_value layerscale_value logit_scale_init_value mask_cost
+    mask_loss_coefficient mask_weight max_depth memory_attention_dropout
+    memory_attention_rope_dropout memory_attention_rope_theta memory_fuser_layer_scale_init_value
+    mlp_ratio mlp_ratios new_det_thresh no_object_weight oversample_ratio pos_embed_jitter
+    pos_embed_rescale pos_embed_shift positional_embedding_temperature reassemble_factors
+    rope_theta scale_factors score_threshold_detection semantic_classifier_dropout
+    sigmoid_bias_for_mem_enc sigmoid_scale_for_mem_enc
+    suppress_overlapping_based_on_recent_occlusion_threshold text_enhancer_dropout
+    trk_assoc_iou_thresh
+"""
+_FLAGS = """
+    add_cross_attention add_fpn add_projection apply_layernorm auxiliary_concat_input
+    auxiliary_loss decoder_bbox_embed_share decoder_cls_embed_share
+    decrease_trk_keep_alive_for_empty_masklets dilation disable_custom_kernels
+    downsample_in_bottleneck downsample_in_first_stage dynamic_multimask_via_stability
+    embedding_dynamic_padding embedding_init_target enable_occlusion_spatial_embedding
+    enable_temporal_pos_encoding_for_object_pointers enforce_input_proj enforce_input_projection
+    is_decoder is_hybrid is_training key_bias mlp_bias multimask_output_for_tracking
+    multimask_output_in_sam output_auxiliary_logits pre_norm proj_bias qkv_bias query_bias
+    recondition_on_trk_masks reshape_hidden_states reshape_last_stage
+    suppress_unmatched_only_within_hotstart tie_word_embeddings two_stage
+    two_stage_bbox_embed_share use_abs_pos use_absolute_embeddings
+    use_absolute_position_embeddings use_auxiliary_head use_auxiliary_loss
+    use_batch_norm_in_fusion_residual use_bias_in_fusion_residual use_cache
+    use_complex_transposed_convolution use_gated_mlp use_mask_token use_mean_pooling use_rel_pos
+    use_relative_position_bias use_shared_relative_position_bias use_swiglu_ffn use_task_norm
+    value_bias vision_use_head
+"""
+_WORDS = """
+    _out_features activation_function decoder_hidden_act depth_estimation_type global_padding
+    hidden_act layer_type mask_downsampler_hidden_act memory_attention_feed_forward_hidden_act
+    memory_attention_rope_type memory_fuser_hidden_act norm out_features pooler_act
+    position_embedding_type readout_type rope_type type
+"""
 
-_ANY_SIGN = re.compile(
-    r"_id$|ind(ex|ic)|ignore|extract|blocks$|keep_alive|delay|thresh|area|scale$"
-)
-"""Settings of whole numbers that may be negative."""
+_KNOWN_WORDS = """
+    absolute add axial basic bottleneck default gelu gelu_fast gelu_new gelu_pytorch_tanh GN ignore
+    learned leaky_relu metric mish preactivation project quick_gelu relative relu relu2 relu6 same
+    SAME sigmoid silu sine swish tanh valid VALID
+"""
 
-_REAL = re.compile(r"cost|coefficient|mlp_ratio|factors$|temperature|max_depth")
-"""Settings that may be fractions though their defaults are whole."""
+NUMBERS = {
+    name: kind
+    for names, kind in (
+        (_LAYERS, Numbers(0, 200, sum_at_most=200)),
+        (_STEPS, Numbers(0, 64)),
+        (_SIDES, Numbers(-1, 8192)),
+        (_SIZES, Numbers(0, 1 << 20)),
+        (_WHOLE, Numbers(-(1 << 20), 1 << 20)),
+        (_REAL, Numbers(-1e9, 1e9, whole=False)),
+    )
+    for name in names.split()
+}
+"""Keys whose values are numbers or lists of them."""
 
-_MOST_LAYERS, _LONGEST_STEP, _LONGEST_SIDE = 200, 64, 8192
-_LARGEST_WHOLE, _LARGEST_REAL = 1 << 20, 1e9
+FLAGS = frozenset(_FLAGS.split())
+"""Keys that are true or false."""
+
+WORDS = {name: frozenset(_KNOWN_WORDS.split()) for name in _WORDS.split()}
+"""Keys whose values are words, and which; names of stages are words too."""
 
 _SAM_PARTS = ("prompt_encoder", "mask_decoder")
 _SWIN = ("swin", "maskformer-swin", "resnet")
@@ -214,16 +306,17 @@ class _Checked:
 
     def part(self, content: Mapping[str, Any], kind: str, where: str) -> dict[str, Any]:
         """What may be said of a network or a part of one, of a type, at a place of the file."""
-        parts, settings = PARTS.get(kind, {}), _settings(kind)
+        parts = PARTS.get(kind, {})
         self._refuse(content, kind, where)
+        fields = _fields(kind)
         found: dict[str, Any] = {"model_type": kind}
         for key, value in content.items():
-            name, default = where + key, settings.get(key)
-            known = key in _MORE or (key in settings and key not in (_BACKBONE, "model_type"))
-            if key == "attn_implementation" or (value is None and (key in parts or known)):
-                found[key] = value
-            elif value is None:
+            name = where + key
+            listed = key in parts or key in NUMBERS or key in FLAGS or key in WORDS
+            if key == "model_type" or (value is None and not listed):
                 continue
+            if value is None or key == "attn_implementation":
+                found[key] = value
             elif key in parts:
                 found[key] = self._inner(value, parts[key], name)
             elif key == "rope_parameters":
@@ -231,12 +324,11 @@ class _Checked:
             elif key == "id2label":
                 found[key] = self._classes(value, name)
             elif key == "num_labels":
-                self._check_numbers(value, (1, _MOST_CLASSES), name)
-                found[key] = value
-            elif known:
-                if type(value) is not type(default) or value != default:
-                    self._check(key, value, default, name)
-                found[key] = value
+                found[key] = self._numbers(value, Numbers(1, _MOST_CLASSES), name)
+            elif listed:
+                found[key] = self._value(key, value, name)
+            elif key != _BACKBONE and key in fields and value != fields[key]:
+                self._fail(name, "no such setting, which splatseg does not know", value)
         return found
 
     def _inner(self, value: object, kinds: tuple[str, ...], name: str) -> dict[str, Any]:
@@ -253,40 +345,27 @@ class _Checked:
         if not isinstance(value, dict):
             self._fail(name, "settings of positions", value)
         content = cast("dict[str, Any]", value)
-        for key, one in content.items():
-            self._check(key, one, None, f"{name}.{key}")
-        return content
+        known = {key: one for key, one in content.items() if key in NUMBERS or key in WORDS}
+        return {key: self._value(key, one, f"{name}.{key}") for key, one in known.items()}
 
-    def _check(self, key: str, value: object, default: object, name: str) -> None:
-        """Refuse a setting that is not as its default, or out of all bounds."""
+    def _value(self, key: str, value: object, name: str) -> object:
         if key.endswith("_token_id") and isinstance(value, list):
             self._fail(name, "the number of one token", value)
-        while isinstance(default, list):
-            default = cast("list[object]", default)[0] if default else None
-        flat = self._flat(value, name)
-        if isinstance(default, bool) and not isinstance(value, bool):
-            self._fail(name, "true or false", value)
-        if isinstance(value, bool) and (default is None or isinstance(default, bool)):
-            return
-        if isinstance(default, str) or (default is None and any(isinstance(x, str) for x in flat)):
-            for word in flat:
-                if not (isinstance(word, str) and (word in _WORDS or _STAGE.fullmatch(word))):
-                    self._fail(name, "a word that networks of this kind have", word)
-        elif isinstance(default, float) or _REAL.search(key):
-            self._check_numbers(value, (-_LARGEST_REAL, _LARGEST_REAL), name, whole=False)
-        elif _LAYERS.search(key):
-            self._check_numbers(value, (0, _MOST_LAYERS), name, whole=default is not None)
-            if math.fsum(cast("list[float]", flat)) > _MOST_LAYERS:
-                self._fail(name, f"a sum of at most {_MOST_LAYERS}", value)
-        else:
-            bounds = (-_LARGEST_WHOLE if _ANY_SIGN.search(key) else 0, _LARGEST_WHOLE)
-            if _SIDES.search(key):
-                bounds = (-1, _LONGEST_SIDE)
-            elif _STEPS.search(key):
-                bounds = (0, _LONGEST_STEP)
-            self._check_numbers(value, bounds, name, whole=default is not None)
+        if key in NUMBERS:
+            return self._numbers(value, NUMBERS[key], name)
+        if key in FLAGS:
+            if not isinstance(value, bool):
+                self._fail(name, "true or false", value)
+            return value
+        words = cast("list[object]", value) if isinstance(value, list) else [value]
+        for word in words:
+            known = isinstance(word, str) and (word in WORDS[key] or _STAGE.fullmatch(word))
+            if not known:
+                self._fail(name, "a word that networks of this kind have", word)
+        return value
 
-    def _flat(self, value: object, name: str) -> list[object]:
+    def _numbers(self, value: object, kind: Numbers, name: str) -> object:
+        """A number, or lists of them, at most one in the other."""
         flat = [value]
         for _ in range(2):
             flat = [
@@ -296,17 +375,19 @@ class _Checked:
             ]
             if len(flat) > _MOST_ENTRIES:
                 self._fail(name, f"at most {_MOST_ENTRIES} numbers", value)
-        return flat
-
-    def _check_numbers(
-        self, value: object, bounds: tuple[float, float], name: str, *, whole: bool = True
-    ) -> None:
-        low, high = bounds
-        for number in self._flat(value, name):
-            fits = isinstance(number, int if whole else int | float)
-            if not fits or isinstance(number, bool) or not low <= cast(float, number) <= high:
-                what = "a whole number" if whole else "a number"
-                self._fail(name, f"{what} from {low:g} to {high:g}", number)
+        for number in flat:
+            fits = isinstance(number, int if kind.whole else int | float)
+            if (
+                not fits
+                or isinstance(number, bool)
+                or not kind.low <= cast(float, number) <= kind.high
+            ):
+                what = "a whole number" if kind.whole else "a number"
+                self._fail(name, f"{what} from {kind.low:g} to {kind.high:g}", number)
+        total = math.fsum(cast("list[float]", flat))
+        if kind.sum_at_most is not None and total > kind.sum_at_most:
+            self._fail(name, f"a sum of at most {kind.sum_at_most:g}", value)
+        return value
 
     def _classes(self, value: object, name: str) -> dict[str, str]:
         if (
@@ -353,7 +434,7 @@ class _Checked:
         raise FileFormatError(f"{self._path}: {name:.60}: expected {expected}, got {quoted(got)}.")
 
 
-def _settings(kind: str) -> dict[str, Any]:
+def _fields(kind: str) -> dict[str, Any]:
     """Settings that the installed library knows of a network of a type, and their defaults.
 
     Those that all networks have (architectures, the type of the weights, what is returned) change
