@@ -197,4 +197,4 @@ def test_what_is_wrong_is_one_sentence(made, generated_drive, boxes, splatseg, t
     assert not (tmp_path / "out").exists()
     status, out, _ = splatseg("info", root)
     assert status == 0
-    assert "drive.json: expected a field overlap, got none." in out
+    assert "drive.json: expected a field overlap, got none" in out

@@ -274,15 +274,15 @@ def answers() -> Any:
     from splatseg.core import Features
     from splatseg.lift import TextSpace
     from splatseg.lift.vocabulary import Vocabulary
-    from splatseg.lift.words import WordAnswers, WordIndex
-    from splatseg.tasks import Answers, QueryOptions
+    from splatseg.lift.words import WordIndex, WordMatches
+    from splatseg.tasks import QueryOptions, QueryResult
 
     none = torch.zeros(COUNT, 1)
     values = torch.rand(COUNT, 4, generator=torch.Generator().manual_seed(0))
     vocabulary = Vocabulary(space=TextSpace(width=4))
-    return Answers(
+    return QueryResult(
         words=("cup",), found={"cup": ()}, surest={"cup": 0.0},
-        vectors=WordAnswers(words=("cup",), cosines=none, probabilities=none),
+        vectors=WordMatches(words=("cup",), cosines=none, probabilities=none),
         index=WordIndex(Features(values=values), vocabulary), layer="objects",
         options=QueryOptions(),
     )  # fmt: skip
@@ -309,7 +309,7 @@ def special(world: World, by_type: dict[type, Any]) -> dict[str, Any]:
     return {
         **inner(world, by_type),
         "tasks.select.prompts": [AxisBox(low=(-9, -9, -9), high=(9, 9, 9))],
-        "tasks.draw_answers.answers": answers(),
+        "tasks.draw_query_result.answers": answers(),
         "tasks.draw_heat.answers": answers(),
         "tasks.write_query_report.answers": answers(),
         "tasks.draw_selection.prompts": [AxisBox(low=(-9, -9, -9), high=(9, 9, 9))],

@@ -44,7 +44,7 @@ NewScene: TypeAlias = Annotated[
     Path, _flag("NEW", "Scene folder to write. It must not exist yet.", "-o")
 ]
 
-MadeSceneFolder: TypeAlias = Annotated[
+NewSceneFolder: TypeAlias = Annotated[
     Path,
     _flag(
         "SCENE", "Scene folder to write. An existing scene is replaced unless it has layers.", "-o"

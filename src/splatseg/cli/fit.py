@@ -10,7 +10,7 @@ import tyro
 
 from splatseg.cli._shared import (
     Backend,
-    MadeSceneFolder,
+    NewSceneFolder,
     Printing,
     Seed,
     print_result,
@@ -43,7 +43,7 @@ class Command(Printing):
     """The capture: a folder of COLMAP, nerfstudio, Blender, LLFF or IDR data, a folder of bare
     photographs, or a video."""
 
-    output: MadeSceneFolder
+    output: NewSceneFolder
 
     minutes: float | None = None
     """Length of the optimisation, minutes. Finding poses comes before it and is not counted; scores
@@ -214,7 +214,7 @@ class ImportCommand(Printing):
     file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
     """The splat file: PLY, compressed PLY, .splat, SPZ, SOG or glTF."""
 
-    output: MadeSceneFolder
+    output: NewSceneFolder
 
     importing: Annotated[ImportOptions, tyro.conf.arg(name="")] = field(
         default_factory=ImportOptions

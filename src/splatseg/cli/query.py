@@ -24,11 +24,11 @@ from splatseg.errors import InputError
 from splatseg.io.scene import check_name, save_scene_layer
 from splatseg.io.scene_folder import work_on_scene
 from splatseg.tasks import (
-    Answers,
     QueryOptions,
+    QueryResult,
     QuerySession,
-    draw_answers,
     draw_heat,
+    draw_query_result,
     write_query_report,
 )
 from splatseg.tasks.work import Work
@@ -162,7 +162,7 @@ def _views(command: Command, scene: Scene) -> tuple[View, ...]:
     return Work(scene=scene).views(command.views, frames=command.frames)
 
 
-def _answered(answers: Answers, top: int) -> tuple[dict[str, Any], list[str]]:
+def _answered(answers: QueryResult, top: int) -> tuple[dict[str, Any], list[str]]:
     facts: dict[str, Any] = {
         "source": answers.layer,
         "words": {},
@@ -189,11 +189,11 @@ def _answered(answers: Answers, top: int) -> tuple[dict[str, Any], list[str]]:
 
 
 def _drawn(
-    command: Command, scene: Scene, answers: Answers, views: tuple[View, ...]
+    command: Command, scene: Scene, answers: QueryResult, views: tuple[View, ...]
 ) -> Iterator[tuple[str, Path, tuple[Path, ...]]]:
     """What is drawn, by its name: the folder and the files."""
     if command.picture is not None:
-        files = draw_answers(
+        files = draw_query_result(
             answers, scene, command.picture, top=command.top, backend=command.backend
         )
         yield "pictures", command.picture, files

@@ -9,9 +9,9 @@ import tyro
 from splatseg.cli._shared import OnScene, print_result
 from splatseg.cli._words import option_value
 from splatseg.models import (
+    DescribedEvidence,
     LoadOptions,
     ModelFamily,
-    SeenEvidence,
     TrackingOptions,
     find_family,
     model_names,
@@ -181,7 +181,7 @@ def run(command: Command) -> None:
     print_result(facts, lines, json=command.json)
 
 
-def summary(seen: SeenEvidence) -> str:
+def summary(seen: DescribedEvidence) -> str:
     """One line on what was written."""
     new = seen.views - seen.kept
     parts = [f"{seen.kind} of {seen.views} views by {seen.model}"]

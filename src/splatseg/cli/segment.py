@@ -44,7 +44,7 @@ task, which says why."""
 
 
 _COMPLETION = (
-    "neighbours", "spread_steps", "own_evidence", "min_inferred", "colour_width", "feature_width",
+    "neighbours", "spread_steps", "train_evidence", "min_inferred", "colour_width", "feature_width",
     "smoothing", "smoothing_steps", "completed_layer",
 )  # fmt: skip
 

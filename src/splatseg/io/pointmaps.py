@@ -24,7 +24,7 @@ from splatseg.core.models import Pointmap
 from splatseg.errors import InputError, MissingFileError, quoted
 from splatseg.io.arrays import read_npz, save_arrays
 from splatseg.io.atomic import atomic_file, named_write_failures
-from splatseg.io.foreign import expect, made_from
+from splatseg.io.foreign import derived_from, expect
 from splatseg.io.json_files import check_version, read_json, write_json
 from splatseg.io.schema import check_array, structured
 
@@ -177,7 +177,7 @@ def _pointmap(path: Path, points: NDArray[Any], confidence: NDArray[Any], which:
     sides = all(1 <= side <= _MAX_SIDE for side in shape[:2])
     expect(sides, path, f"points_{which} of 1 to {_MAX_SIDE} a side, got {shape}")
     check_array(path, f"confidence_{which}", confidence, shape[:2], "f")
-    with made_from(path):
+    with derived_from(path):
         return Pointmap(
             points=torch.from_numpy(points.astype(np.float32)),
             confidence=torch.from_numpy(confidence.astype(np.float32)),

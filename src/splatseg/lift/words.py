@@ -161,7 +161,7 @@ _AT_ONCE = 65_536
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class WordAnswers:
+class WordMatches:
     """What features answer to words."""
 
     words: tuple[str, ...]
@@ -183,12 +183,12 @@ def context_of(vocabulary: Vocabulary) -> tuple[str, ...]:
 
 
 @boundary
-def answer_words(
+def match_words(
     values: Float[Tensor, "n channels"],
     words: Sequence[str],
     vocabulary: Vocabulary,
     span: WordSpan,
-) -> WordAnswers:
+) -> WordMatches:
     """Ask features, of objects or of Gaussians, for words.
 
     The result does not depend on the number of threads.
@@ -212,7 +212,7 @@ def answer_words(
         for part in values.split(_AT_ONCE)
     ]
     cosines = torch.cat([part[0] for part in parts])
-    return WordAnswers(
+    return WordMatches(
         words=tuple(word.strip() for word in words),
         cosines=cosines,
         probabilities=torch.cat([part[1] for part in parts]),
@@ -284,9 +284,9 @@ class WordIndex:
         return self._rows
 
     @boundary
-    def ask(self, words: Sequence[str]) -> WordAnswers:
-        """What each vector answers, see `answer_words`."""
-        return answer_words(self.values, words, self.vocabulary, self.span)
+    def ask(self, words: Sequence[str]) -> WordMatches:
+        """What each vector answers, see `match_words`."""
+        return match_words(self.values, words, self.vocabulary, self.span)
 
     @boundary
     def of_gaussians(self, found: Shaped[Tensor, "k words"]) -> Shaped[Tensor, "n words"]:

@@ -90,7 +90,7 @@ class EvidenceRequest:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SeenEvidence:
+class DescribedEvidence:
     """What was written."""
 
     folder: Path
@@ -116,7 +116,7 @@ class SeenEvidence:
     notes: tuple[str, ...]
     """What the user should know of the evidence, a sentence each."""
 
-    further: tuple["SeenEvidence", ...] = ()
+    further: tuple["DescribedEvidence", ...] = ()
     """What was written beside it, where several kinds were asked for."""
 
 
@@ -128,7 +128,7 @@ def record_evidence(
     request: EvidenceRequest = EvidenceRequest(),
     *,
     progress: Callable[[int, int], None] | None = None,
-) -> SeenEvidence:
+) -> DescribedEvidence:
     """Write what a model sees in views, one view at a time; a second call does what is left.
 
     A recorded model's evidence is checked and copied; no photograph is read for it. If it fails,
@@ -255,9 +255,9 @@ class _Target:
         self.writer.finish(self.folder)
         _write_header(self.folder, self.writer, {**self.metadata, "complete": True})
 
-    def seen(self, model: str, seconds: float) -> SeenEvidence:
+    def seen(self, model: str, seconds: float) -> DescribedEvidence:
         files = (path for path in self.target.rglob("*") if path.is_file())
-        return SeenEvidence(
+        return DescribedEvidence(
             folder=self.target,
             model=model,
             kind=self.writer.kind,

@@ -246,7 +246,7 @@ class ComputedEvidence(EvidenceWriter):
         if isinstance(found, DeepFeatures | Panoptic):
             maps = found.maps if isinstance(found, DeepFeatures) else (found.ids,)
         for one in maps:
-            check_answer(self._model, view, one)
+            check_output(self._model, view, one)
         if isinstance(found, MaskSet):
             masks = without_empty(found)
             save_masks(masks, folder, view.name)
@@ -285,7 +285,7 @@ class ComputedEvidence(EvidenceWriter):
         return (f"{len(none)} of {len(self._counts)} views have no mask at all ({some(none)}).",)
 
 
-def check_answer(model: Model, view: View, found: Any) -> None:
+def check_output(model: Model, view: View, found: Any) -> None:
     """Refuse what has not the photograph's size."""
     camera = view.camera
     if (found.height, found.width) != (camera.height, camera.width):

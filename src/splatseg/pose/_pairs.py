@@ -51,7 +51,7 @@ def all_pairs(count: int) -> list[tuple[int, int]]:
     return [(i, j) for i in range(count) for j in range(i + 1, count)]
 
 
-def chosen_pairs(
+def selected_pairs(
     alike: NDArray[np.float32], *, overlap: int, neighbours: int
 ) -> list[tuple[int, int]]:
     """Each photograph with those that follow it and those that look most like it, sorted.
@@ -59,7 +59,7 @@ def chosen_pairs(
     Example:
         >>> alike = np.eye(4, dtype=np.float32)
         >>> alike[0, 3] = alike[3, 0] = 0.5
-        >>> chosen_pairs(alike, overlap=1, neighbours=1)
+        >>> selected_pairs(alike, overlap=1, neighbours=1)
         [(0, 1), (0, 3), (1, 2), (2, 3)]
     """
     count = len(alike)

@@ -22,7 +22,7 @@ from splatseg.core.models import Image, Pointmap, PointmapModel
 from splatseg.core.options import Count, Natural, options
 from splatseg.errors import InputError, quoted
 from splatseg.io.pointmaps import RecordedPointmaps, create_pointmaps
-from splatseg.pose._pairs import chosen_pairs, connected_groups, likeness
+from splatseg.pose._pairs import connected_groups, likeness, selected_pairs
 from splatseg.pose._photographs import Photograph, read_reduced
 
 PairGraph = Literal["auto", "complete", "window", "reference", "retrieval"]
@@ -149,7 +149,7 @@ def _graph(
     if kind == "reference":
         return [(0, j) for j in range(1, count)]
     alike = likeness([_descriptors(one) for one in photographs], seed=options.seed)
-    return chosen_pairs(alike, overlap=1, neighbours=_NEIGHBOURS)
+    return selected_pairs(alike, overlap=1, neighbours=_NEIGHBOURS)
 
 
 def _descriptors(photograph: Photograph) -> NDArray[np.uint8]:

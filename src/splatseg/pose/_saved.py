@@ -22,7 +22,7 @@ from splatseg.io.atomic import atomic_file, named_write_failures
 from splatseg.io.captures.build import build_capture
 from splatseg.io.captures.colmap_model import intrinsics_of, poses_of, read_colmap_model
 from splatseg.io.captures.raw_views import Intrinsics, RawView
-from splatseg.io.foreign import made_from
+from splatseg.io.foreign import derived_from
 from splatseg.io.json_files import parse_object, read_json, write_json
 from splatseg.io.schema import structured
 from splatseg.pose._photographs import LeftOut, Photograph, PoseOptions
@@ -346,7 +346,7 @@ def load_world(folder: Path, *, made_of: str | None = None) -> SavedWorld | None
                 f"{path}: expected {name} as {kind} of {shape}, got {array.dtype} of {array.shape}."
             )
     report = structured(header.get("report"), PointmapReport, where=f"{path}: report")
-    with made_from(path):
+    with derived_from(path):
         cloud = PointCloud(
             points=torch.from_numpy(arrays["points"]), colours=torch.from_numpy(arrays["colours"])
         )

@@ -43,7 +43,7 @@ from splatseg.pose._pointmap_start import (
     spanning_tree,
     tree_world,
 )
-from splatseg.pose._recover import PoseProgress, given_or_temporary, teller
+from splatseg.pose._recover import PoseProgress, requested_or_temporary, teller
 from splatseg.pose._saved import (
     ANSWERS,
     SavedWorld,
@@ -157,7 +157,7 @@ def recover_from_pointmaps(
         raise InputError(f"{bad[0].name}: expected photographs that can be read, got {bad[0].why}.")
     asked = _CONSTANTS | asdict(options) | {"source": source_digest(source)}
     made_of = content_digest(files, asked)
-    with given_or_temporary(folder) as kept:
+    with requested_or_temporary(folder) as kept:
         world = load_world(kept, made_of=made_of)
         reused = world is not None
         if world is None:

@@ -38,7 +38,7 @@ from splatseg.prompting.retrieval import (
     mean_threshold,
     scores,
 )
-from splatseg.prompting.seen import SeenPrompt
+from splatseg.prompting.seen import VisiblePrompt
 from splatseg.render import SparseWeights
 
 ThresholdRule = Literal["fixed", "adaptive"]
@@ -112,7 +112,7 @@ class FeatureMembership:
 
     @boundary
     def membership(
-        self, prompts: Sequence[SeenPrompt], *, granularity: float | None = None
+        self, prompts: Sequence[VisiblePrompt], *, granularity: float | None = None
     ) -> Float[Tensor, "n"]:
         """How likely each Gaussian belongs to what is shown, see `MembershipSource`.
 
@@ -134,7 +134,7 @@ class FeatureMembership:
             confidence = torch.minimum(confidence, (0.5 + (found - against)).clamp(0, 1))
         return confidence if self._seen is None else confidence.where(self._seen, 0.0)
 
-    def _queries(self, prompts: Sequence[SeenPrompt]) -> dict[Similarity, Float[Tensor, "q d"]]:
+    def _queries(self, prompts: Sequence[VisiblePrompt]) -> dict[Similarity, Float[Tensor, "q d"]]:
         """Positive queries of all prompts, those of one similarity together."""
         found: dict[Similarity, list[Tensor]] = {"cosine": [], "dot": []}
         for prompt in prompts:
@@ -172,11 +172,11 @@ class FeatureMembership:
             return None
         return head.gate(head.scale(_OBJECT if granularity is None else granularity))
 
-    def _negative(self, prompt: SeenPrompt) -> Float[Tensor, "q d"]:
+    def _negative(self, prompt: VisiblePrompt) -> Float[Tensor, "q d"]:
         """Queries of what is not meant."""
         return self._thinned(prompt, self._shown(prompt.negative_rows))
 
-    def _thinned(self, prompt: SeenPrompt, shown: Float[Tensor, "p d"]) -> Float[Tensor, "q d"]:
+    def _thinned(self, prompt: VisiblePrompt, shown: Float[Tensor, "p d"]) -> Float[Tensor, "q d"]:
         """What pixels show, of strokes, masks and boxes the centres of k-means."""
         many = prompt.dense and len(shown) > _CLUSTERS
         return self._centres(shown) if many else shown
@@ -186,7 +186,7 @@ class FeatureMembership:
         shown = rows.to("cpu").product(self._values)
         return shown[torch.linalg.vector_norm(shown, dim=1) > 0]
 
-    def _mask_queries(self, prompt: SeenPrompt) -> Float[Tensor, "q d"] | None:
+    def _mask_queries(self, prompt: VisiblePrompt) -> Float[Tensor, "q d"] | None:
         """Queries of a mask by 2D features; None where there are none."""
         head = self._head
         if head is None or not head.projector or self._guidance is None or prompt.inside is None:

@@ -18,7 +18,7 @@ from splatseg.core.boundary import boundary
 from splatseg.core.options import removed_options
 from splatseg.errors import FileFormatError, MissingFileError, quoted, visible
 from splatseg.io.atomic import named_write_failures, path_inside
-from splatseg.io.foreign import expect, made_from
+from splatseg.io.foreign import derived_from, expect
 from splatseg.io.json_files import (
     check_version,
     json_text,
@@ -123,7 +123,7 @@ def load_mesh_field(path: Path) -> MeshField:
     seen = tensors.get("seen")
     if seen is not None and not seen.is_floating_point():
         raise FileFormatError(f"{path}: seen: expected floating-point numbers, got {seen.dtype}.")
-    with made_from(path):
+    with derived_from(path):
         mesh = _mesh(tensors, about.sizes, path)
         return MeshField(
             mesh,
@@ -386,7 +386,7 @@ def load_drive(path: Path) -> DriveBlocks:
     content = read_json(path)
     check_version(path, content, format=DRIVE_FORMAT, version=DRIVE_VERSION, what="a drive")
     drive = structured(content, _Drive, where=path)
-    with made_from(path):
+    with derived_from(path):
         blocks = tuple(
             DriveBlock(
                 index=i,

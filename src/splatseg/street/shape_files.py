@@ -11,7 +11,7 @@ from torch import Tensor
 
 from splatseg.core.boundary import boundary
 from splatseg.errors import FileFormatError, MissingFileError
-from splatseg.io.foreign import expect, is_file, made_from
+from splatseg.io.foreign import derived_from, expect, is_file
 from splatseg.io.json_files import parse_object
 from splatseg.io.schema import structured
 from splatseg.io.tensor_table import TensorTable
@@ -121,7 +121,7 @@ def published_shapes(content: object, path: Path) -> ShapeAutoEncoder:
         )
     tables = {key: TensorTable(tensors, path) for key, tensors in parts.items()}
     widths = {key: _widths(table) for key, table in tables.items()}
-    with made_from(path):
+    with derived_from(path):
         config = ShapeConfig(
             code_size=tables[_DECODER].matrix_shape(_FIRST)[1],
             decoder_widths=widths[_DECODER],

@@ -26,9 +26,9 @@ from splatseg.io.images import image_camera, load_image
 from splatseg.io.scene import check_name
 from splatseg.io.scene_folder import scene_path, work_on_scene
 from splatseg.models import (
+    DescribedEvidence,
     EvidenceRequest,
     LoadOptions,
-    SeenEvidence,
     TrackingOptions,
     What,
     find_family,
@@ -105,7 +105,7 @@ def see(
     loading: LoadOptions | None = None,
     backend: BackendName = "auto",
     observer: Observer = SILENT,
-) -> SeenEvidence:
+) -> DescribedEvidence:
     """Write what a model sees in views to SCENE/evidence/NAME, a file a view.
 
     A view with a photograph is shown by it. One that has none, a virtual view, is drawn, and the

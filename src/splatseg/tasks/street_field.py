@@ -68,7 +68,7 @@ class FieldBuilder:
         field_options: DnmpOptions | None,
     ) -> None:
         self.work, self.inputs, self.options = work, inputs, options
-        self.chosen = chosen_options(options, field_options)
+        self.chosen = selected_options(options, field_options)
         self.layer = options.layer or inputs.name
         self.timings: dict[str, float] = {}
 
@@ -137,7 +137,7 @@ class FieldBuilder:
         self.timings[stage] = self.timings.get(stage, 0.0) + seconds
 
 
-def chosen_options(options: StreetOptions, given: DnmpOptions | None) -> DnmpOptions:
+def selected_options(options: StreetOptions, given: DnmpOptions | None) -> DnmpOptions:
     """How fields are made: as given, in the published setting where the field is to be that."""
     if given is None:
         return PUBLISHED if options.published else DnmpOptions()

@@ -303,7 +303,7 @@ def scene_field(scene: Scene, name: str, *, vertex_rule: "VertexRule | None" = N
     return load_mesh_field(path).with_layer(vertex_rule=vertex_rule)
 
 
-def views_that_made(scene: Scene, info: LayerInfo, evidence: Evidence) -> tuple[View, ...]:
+def source_views(scene: Scene, info: LayerInfo, evidence: Evidence) -> tuple[View, ...]:
     """Views with evidence that made a layer, where it says which; else the training views."""
     known = set(evidence.view_names)
     names = None if info.views is None else set(info.views)

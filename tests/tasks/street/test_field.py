@@ -13,7 +13,7 @@ from splatseg.errors import InputError
 from splatseg.io.evidence import create_evidence
 from splatseg.io.scans import read_scans
 from splatseg.io.scene import scene_field_names
-from splatseg.street.build import DnmpOptions, seen_shares
+from splatseg.street.build import DnmpOptions, visible_shares
 from splatseg.tasks import (
     EvaluationOptions,
     RenderingOptions,
@@ -184,7 +184,7 @@ def test_maps_of_the_capture_give_depth_and_points(drive, tmp_path) -> None:
 
 def test_what_a_ray_saw_next_to_nothing_of_was_adjusted() -> None:
     """float16 holds no number so small; Adam moved the vertex by its whole rate all the same."""
-    shares = seen_shares(torch.tensor([0.0, 1e-30, 1e-7, 10.0, 1e9]))
+    shares = visible_shares(torch.tensor([0.0, 1e-30, 1e-7, 10.0, 1e9]))
     assert shares.tolist() == [0.0, 2.0**-24, 2.0**-24, 0.5, 1.0]
     assert torch.equal(shares, shares.half().float())
 

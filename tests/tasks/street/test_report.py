@@ -20,10 +20,10 @@ from splatseg.street.field import MeshField
 from splatseg.tasks import ScanLabelOptions, StreetOptions, label_scans, open_drive, street_field
 from splatseg.tasks.street_report import (
     LabelledScans,
-    in_sight,
     point_scores,
     report_street,
     true_ids,
+    visibility_of_points,
 )
 from support.analytic import BallOverFloor
 from support.mesh_fields import balls, told_field
@@ -106,10 +106,10 @@ def test_whose_views_and_depth_say_what_was_seen(made, scene, tmp_path) -> None:
     other = replace(scene.train_views[1], camera=camera(0.0), depth=None)
     known = replace(scene, views=(mapped, other))
     field = balls_field(views=(mapped.name,))
-    seen, whose = in_sight(known, field, "semantic", cloud)
+    seen, whose = visibility_of_points(known, field, "semantic", cloud)
     assert (seen.tolist(), whose) == ([True, True, False], "the capture's depth maps")
     field = balls_field(views=(mapped.name, other.name))
-    seen, whose = in_sight(known, field, "semantic", cloud)
+    seen, whose = visibility_of_points(known, field, "semantic", cloud)
     assert whose == "the depth that the field shows"
     assert seen.tolist() == [False, False, False], "its ball stands before them"
 

@@ -46,7 +46,7 @@ from splatseg.io.captures.waymo import (
     find_segments,
     one_segment,
 )
-from splatseg.io.foreign import expect, is_file, is_folder, made_from, malformed
+from splatseg.io.foreign import derived_from, expect, is_file, is_folder, malformed
 from splatseg.io.json_files import read_json, write_json
 from splatseg.io.moving.views import CLOCKS, Clock
 from splatseg.io.parquet import Row, integer_of, number_of, read_rows
@@ -134,7 +134,7 @@ def _read_json(path: Path) -> tuple[MovingBox, ...]:
         expect(not twice, where, "a time, or a start and an end, got both")
         start = box.time if box.start is None else box.start
         end = box.time if box.end is None else box.end
-        with made_from(where):
+        with derived_from(where):
             found.append(
                 MovingBox(
                     centre=torch.tensor(box.centre, dtype=torch.float64),
@@ -213,7 +213,7 @@ def _kitti360_box(stored: StoredObject, frame: int, times: NDArray[np.float64] |
     low, high = along.min(axis=0), along.max(axis=0)
     start, end = _span(times, frame)
     name = f"{stored.text('label') or 'thing'} {stored.text('instanceId')}"
-    with made_from(stored.where):
+    with derived_from(stored.where):
         return MovingBox(
             centre=torch.from_numpy(transform[:3, 3] + axes @ ((low + high) / 2)),
             size=(float(high[0] - low[0]), float(high[1] - low[1]), float(high[2] - low[2])),
@@ -287,7 +287,7 @@ def _waymo_box(
     x, y, z, heading = values[3:]
     cos, sin = math.cos(heading), math.sin(heading)
     turned = pose[:3, :3] @ np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1.0]])
-    with made_from(where):
+    with derived_from(where):
         return MovingBox(
             centre=torch.from_numpy(pose[:3, :3] @ np.array(values[:3]) + pose[:3, 3]),
             size=(x, y, z),

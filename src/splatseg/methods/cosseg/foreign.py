@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from splatseg.errors import FileFormatError
-from splatseg.io.foreign import made_from
+from splatseg.io.foreign import derived_from
 from splatseg.io.tensor_table import COUNTER, TensorTable, with_state
 from splatseg.methods.cosseg.network import RandlaEncoder, SharedMlp
 from splatseg.methods.cosseg.pyramid import MAX_LEVELS, PointInputs, RandlaConfig
@@ -82,7 +82,7 @@ def _config(table: TensorTable, path: Path) -> RandlaConfig:
         half, _ = table.matrix_shape(f"encoder.{level}.mlp1.conv.weight")
         widths.append(2 * half)
     first, inputs = table.matrix_shape("fc0.weight")
-    with made_from(path):
+    with derived_from(path):
         return RandlaConfig(
             inputs=cast("Any", inputs),
             first_width=first,

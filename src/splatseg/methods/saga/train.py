@@ -48,7 +48,7 @@ from splatseg.methods.saga.model import PROJECTOR, SagaModel
 from splatseg.methods.saga.options import CHANNELS, SagaOptions
 
 
-class KeptMasks:
+class StoredMasks:
     """Masks that are read once, as run lengths: a few MB for a hundred views.
 
     Args:
@@ -224,7 +224,7 @@ def train_saga(
             "got none; guidance=None trains without."
         )
     ordered = voting_views(views, evidence, "masks")
-    kept = KeptMasks(evidence)
+    kept = StoredMasks(evidence)
     source = SagaTargets(kept, ordered, features, grid=options.grid)
     rng = np.random.default_rng((context.seed, _START))
     start, levels = _started(gaussians, ordered, kept, options=options, context=context, rng=rng)
@@ -275,7 +275,7 @@ def train_saga(
 def _started(
     gaussians: Gaussians,
     views: Sequence[View],
-    evidence: KeptMasks,
+    evidence: StoredMasks,
     *,
     options: SagaOptions,
     context: TrainingContext,

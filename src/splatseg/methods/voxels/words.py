@@ -29,7 +29,7 @@ from splatseg.lift.words import (
     MIN_ENERGY,
     SAME_MEANING,
     TEMPERATURE,
-    WordAnswers,
+    WordMatches,
     WordSpan,
     context_of,
     word_span,
@@ -251,8 +251,8 @@ class TableWords:
         return found * inverse[:, None]
 
     @boundary
-    def ask(self, words: Sequence[str]) -> WordAnswers:
-        """What each row answers, see `lift.words.answer_words`.
+    def ask(self, words: Sequence[str]) -> WordMatches:
+        """What each row answers, see `lift.words.match_words`.
 
         The result does not depend on the number of threads.
 
@@ -269,7 +269,7 @@ class TableWords:
         own = torch.exp((own - largest[:, None]).clamp_max(_MAX_EXPONENT))
         found = own / (own + products(against, held.T.contiguous())).clamp_min(_TINY)
         found[self._lengths <= 0] = 0
-        return WordAnswers(
+        return WordMatches(
             words=tuple(word.strip() for word in words), cosines=cosines, probabilities=found
         )
 
