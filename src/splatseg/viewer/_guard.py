@@ -7,6 +7,7 @@ the host that a browser believes to speak to is checked (DNS rebinding), and the
 
 import hmac
 import ipaddress
+import re
 import secrets
 import socket
 import time
@@ -44,6 +45,8 @@ _POLICY = (
 )
 _NOTEBOOKS = "'self' http://localhost:* http://127.0.0.1:* https://localhost:* https://127.0.0.1:*"
 """Pages that may show this one: notebooks are served from another port."""
+
+_HOST = re.compile(r"(\[[0-9a-f:.]{2,45}\]|[^:/@\[\]\s]{1,255})(?::([0-9]{1,5}))?")
 
 Scope = MutableMapping[str, Any]
 Message = MutableMapping[str, Any]
@@ -92,10 +95,10 @@ class Access:
         Names that resolve to this machine only because another one says so are refused; a number
         is nobody's name, and passes where the server listens to more than the machine itself.
         """
-        name, colon, port = host.rpartition(":")
-        if not colon or port != str(self.port):
+        found = _HOST.fullmatch(host.lower())
+        if found is None or int(found[2] or 80) != self.port:
             return False
-        name = name.lower()
+        name = found[1]
         if name in _LOOPBACK or name in (self.host.lower(), f"[{self.host.lower()}]"):
             return True
         if self._local:
