@@ -20,6 +20,9 @@ from numpy.typing import NDArray
 from splatseg.core import Camera
 from splatseg.errors import InputError, brief, reason
 
+FEATURES = ("layer", "coco", "select_suggestion")
+"""What a server can besides the first form of the protocol."""
+
 VERSION = 1
 """Of the protocol. A page of another version is told to load itself again."""
 
@@ -39,8 +42,8 @@ _RIGID = 1e-4
 Mode = Literal["colour", "objects", "blend", "confidence", "depth", "pca", "similarity"]
 SelectMode = Literal["set", "add", "remove", "intersect"]
 SelectKind = Literal[
-    "click", "box", "stroke", "lasso", "polygon", "sphere", "words", "similar", "all", "none",
-    "invert", "grow", "shrink", "fill",
+    "click", "box", "stroke", "lasso", "polygon", "sphere", "words", "similar", "layer", "all",
+    "none", "invert", "grow", "shrink", "fill",
 ]  # fmt: skip
 Stage = Literal["draft", "final"]
 
@@ -57,6 +60,7 @@ Quaternion = tuple[World, World, World, World]
 Byte = Annotated[int, Meta(ge=0, le=255)]
 Colour = tuple[Byte, Byte, Byte]
 Name = Annotated[str, Meta(min_length=1, max_length=80)]
+OptionalName = Annotated[str, Meta(max_length=80)]
 ClassName = Annotated[str, Meta(max_length=80)]
 FileName = Annotated[str, Meta(pattern=r"\A[A-Za-z0-9][A-Za-z0-9._-]{0,79}\Z")]
 LayerName = Annotated[str, Meta(min_length=1, max_length=200)]
@@ -215,9 +219,9 @@ class OfId(_Incoming, kw_only=True):
 
 
 class Keep(_Incoming, kw_only=True):
-    """The selection as an object."""
+    """The selection as an object; without a name one is made up."""
 
-    name: Name
+    name: OptionalName = ""
     class_name: ClassName = ""
     colour: Colour | None = None
 
@@ -260,9 +264,9 @@ class Isolate(_Incoming, kw_only=True):
 
 
 class Join(OfIds, kw_only=True):
-    """Several objects as one."""
+    """Several objects as one, called as the first where no name is given."""
 
-    name: Name
+    name: OptionalName = ""
 
 
 class Split(OfId, kw_only=True):
@@ -273,8 +277,20 @@ class Split(OfId, kw_only=True):
     """a x + b y + c z = d, with "plane"."""
 
 
-class SelectObject(OfId, kw_only=True):
-    """The selection is an object, or is changed by it."""
+class SelectObject(_Incoming, kw_only=True):
+    """The selection is an object or several, or is changed by them."""
+
+    id: Id | None = None
+    ids: Ids | None = None
+    mode: SelectMode = "set"
+
+    def __post_init__(self) -> None:
+        if (self.id is None) == (self.ids is None):
+            raise ValueError("expected an id, or ids")
+
+
+class SelectSuggestion(OfId, kw_only=True):
+    """The selection is a suggestion, or is changed by it."""
 
     mode: SelectMode = "set"
 
@@ -323,6 +339,7 @@ COMMANDS: dict[str, type[_Incoming]] = {
     "accept": OfIds,
     "reject": OfIds,
     "select_object": SelectObject,
+    "select_suggestion": SelectSuggestion,
     "remove": EditOf,
     "duplicate": Move,
     "move": Move,
@@ -344,7 +361,7 @@ class Associate(_Incoming, kw_only=True):
 class Export(_Incoming, kw_only=True):
     """Files for other programs."""
 
-    what: Literal["splat", "objects", "points", "table"] = "splat"
+    what: Literal["splat", "objects", "points", "table", "coco"] = "splat"
     name: FileName
     format: Literal["ply", "compressed.ply", "splat", "spz", "sog", "glb"] | None = None
     ids: Ids | None = None
@@ -464,6 +481,8 @@ class SelectionInfo(_Outgoing, kw_only=True):
 
     count: int
     confidence: float
+    centre: tuple[float, float, float]
+    radius: float
 
 
 class SuggestionInfo(_Outgoing, kw_only=True):
@@ -473,6 +492,8 @@ class SuggestionInfo(_Outgoing, kw_only=True):
     name: str
     count: int
     score: float
+    centre: tuple[float, float, float]
+    radius: float
 
 
 class EditInfo(_Outgoing, kw_only=True):
@@ -490,6 +511,7 @@ class DocumentInfo(_Outgoing, kw_only=True):
     selection: SelectionInfo | None
     suggestions: list[SuggestionInfo]
     edits: list[EditInfo]
+    isolated: list[int]
 
 
 class HomeInfo(_Outgoing, kw_only=True):
@@ -544,6 +566,7 @@ class State(_Outgoing, kw_only=True, tag_field="type", tag="state"):
     source: str | None
     words: bool
     modes: list[str]
+    features: list[str]
     document: DocumentInfo
     undo: str | None
     redo: str | None
@@ -564,6 +587,7 @@ class Patch(_Outgoing, kw_only=True, tag_field="type", tag="patch"):
     suggestions: list[SuggestionInfo] | None
     selection: SelectionInfo | None
     edits: list[EditInfo] | None
+    isolated: list[int] | None
     undo: str | None
     redo: str | None
     author: str

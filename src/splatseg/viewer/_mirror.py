@@ -46,8 +46,9 @@ class Mirror:
             revision=document.revision,
             objects=[self._object(one) for one in document.objects],
             selection=self.selection(document.selection),
-            suggestions=[_suggestion(one) for one in document.suggestions],
+            suggestions=[self._suggestion(one) for one in document.suggestions],
             edits=[_edit(one) for one in document.edits],
+            isolated=list(document.isolated),
         )
 
     def patch(
@@ -66,10 +67,11 @@ class Mirror:
             suggestions=(
                 None
                 if old.suggestions == new.suggestions
-                else [_suggestion(one) for one in new.suggestions]
+                else [self._suggestion(one) for one in new.suggestions]
             ),
             selection=self.selection(new.selection),
             edits=None if old.edits == new.edits else [_edit(one) for one in new.edits],
+            isolated=None if old.isolated == new.isolated else list(new.isolated),
             undo=undo,
             redo=redo,
             author=author,
@@ -79,7 +81,13 @@ class Mirror:
         """How much is selected; None where nothing is."""
         if mask is None:
             return None
-        return messages.SelectionInfo(count=mask.count, confidence=self._extent(mask).confidence)
+        extent = self._extent(mask)
+        return messages.SelectionInfo(
+            count=mask.count,
+            confidence=extent.confidence,
+            centre=extent.centre,
+            radius=extent.radius,
+        )
 
     def centre(self, mask: Mask | None) -> tuple[tuple[float, float, float], float]:
         """The centre and the radius of a mask; of the scene without one."""
@@ -104,6 +112,17 @@ class Mirror:
             radius=extent.radius,
         )
 
+    def _suggestion(self, one: Suggestion) -> messages.SuggestionInfo:
+        extent = self._extent(one.mask)
+        return messages.SuggestionInfo(
+            id=one.id,
+            name=one.name,
+            count=one.mask.count,
+            score=float(one.score),
+            centre=extent.centre,
+            radius=extent.radius,
+        )
+
     def _extent(self, mask: Mask) -> _Extent:
         if mask.id not in self._kept:
             confidence = self._confidence(mask)
@@ -114,12 +133,6 @@ class Mirror:
                 del self._kept[next(iter(self._kept))]
             self._kept[mask.id] = _Extent(centre, radius, round(sure, 4))
         return self._kept[mask.id]
-
-
-def _suggestion(one: Suggestion) -> messages.SuggestionInfo:
-    return messages.SuggestionInfo(
-        id=one.id, name=one.name, count=one.mask.count, score=float(one.score)
-    )
 
 
 def _edit(one: Edit) -> messages.EditInfo:
