@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from splatseg.core import Camera, Labels, Scene, Selection, View
+from splatseg.core import Camera, Scene, Selection, View
 from splatseg.errors import InputError
 from splatseg.io.scene_folder import scene_path
 from splatseg.prompting.prompts import Ball, Lasso, SelectionPrompt, Similar, ViewPrompt
@@ -314,9 +314,12 @@ class SceneAnswers:
         scene = self._session.scene
         if request.kind == "layer":
             layer = scene.layers[request.text]
-            if isinstance(layer, Selection):
-                return layer.as_confidence()
-            raise InputError("layer: expected one that is a selection.")
+            if not isinstance(layer, Selection):
+                raise InputError(
+                    "layer: expected a selection, got another kind of layer; suggest its objects."
+                )
+            confidence = layer.mask.float() if layer.confidence is None else layer.confidence
+            return (confidence * 255).round().to(torch.uint8).numpy()
         whole = np.full(len(scene.gaussians), 255, dtype=np.uint8)
         before = self._selection() if request.kind == "invert" else None
         return whole if before is None else np.where(before >= MEMBER, 0, whole).astype(np.uint8)
