@@ -81,7 +81,8 @@ class Suggestion:
 class Edit:
     """A change of the scene itself, done when it is exported.
 
-    A point x is moved to about + s R (x - about) + t. Edits are of the scene's own Gaussians. Copies are no part of later edits.
+    A point x is moved to about + s R (x - about) + t. Edits are of the scene's own Gaussians:
+    copies are no part of later edits.
     """
 
     kind: EditKind

@@ -100,19 +100,16 @@ class MaskStore:
         return mask.id in self._packed or mask.id in self._arrays or self._is_written(mask.id)
 
     def persist(self, masks: Iterable[Mask]) -> None:
-        """Write masks to the folder, whole and lasting; those that are there stay as they are.
+        """Write masks to the folder, whole and lasting, where they are not there yet.
 
         Raises:
-            InputError: If the store has not one of them.
             OutputError: If the disk is full, or there is no permission.
         """
         if self._folder is None:
             return
         for mask in masks:
             packed, path = self._packed.get(mask.id), self._path(mask.id)
-            if path is None or mask not in self:
-                raise InputError(f"mask: expected one that was stored, got {quoted(mask.id)}.")
-            if packed is None:
+            if packed is None or path is None:
                 continue
             with named_write_failures(path):
                 self._folder.mkdir(parents=True, exist_ok=True)

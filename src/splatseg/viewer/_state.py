@@ -8,7 +8,6 @@ this module imports no torch and no network.
 import math
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import cast
 
 import numpy as np
 
@@ -304,7 +303,8 @@ def _checked_colour(colour: Sequence[int]) -> Colour:
     values = tuple(colour)
     if len(values) != 3 or not all(type(v) is int and 0 <= v <= 255 for v in values):
         raise InputError(f"colour: expected red, green, blue of 0 to 255, got {quoted(values)}.")
-    return cast("Colour", values)
+    red, green, blue = values
+    return red, green, blue
 
 
 def _known(mask: Mask, masks: Masks) -> Mask:
@@ -468,8 +468,22 @@ class History:
         if not self._undone:
             raise InputError("redo: there is nothing to redo.")
 
-    def _moved(self, taken: list[Entry], given: list[Entry], document: Document) -> Document:
+    @property
+    def next_redo(self) -> Entry:
+        """What redoing would do again.
+
+        Raises:
+            InputError: If there is nothing to redo.
+        """
+        self.check_redo()
+        return self._undone[-1]
+
+    def numbered(self, document: Document) -> Document:
+        """A document as the next one after the present."""
         # A revision is never used twice: who saw the one of before must hear of this change.
-        self._document = replace(document, revision=self._document.revision + 1)
+        return replace(document, revision=self._document.revision + 1)
+
+    def _moved(self, taken: list[Entry], given: list[Entry], document: Document) -> Document:
+        self._document = self.numbered(document)
         given.append(taken.pop())
         return self._document
