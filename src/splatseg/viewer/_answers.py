@@ -20,12 +20,24 @@ from splatseg.render import BackendName
 from splatseg.tasks.work import EXPORTS_FOLDER
 from splatseg.viewer import _jobs as jobs
 from splatseg.viewer import _messages as messages
-from splatseg.viewer._document import MEMBER, Apply, Confidence, Document, Edit, Mask
-from splatseg.viewer._document import COMMANDS as STATE_COMMANDS
-from splatseg.viewer._document import Isolate, Join, Keep, Refine, Select, Subtract
+from splatseg.viewer._document import (
+    COMMANDS,
+    MEMBER,
+    Apply,
+    Confidence,
+    Document,
+    Edit,
+    Isolate,
+    Join,
+    Keep,
+    Mask,
+    Refine,
+    Select,
+    Subtract,
+)
 from splatseg.viewer._draw import Drawer, Pace
 from splatseg.viewer._mirror import Mirror, scene_info, view_infos
-from splatseg.viewer._session import Session, open_session
+from splatseg.viewer._session import Session, combined, open_session
 from splatseg.viewer._worker import Client, Job, Worker
 
 _MODES = ("colour", "objects", "blend", "confidence", "depth", "pca", "similarity")
@@ -121,7 +133,7 @@ class SceneAnswers:
             views=self._views,
             layers=list(scene.layers),
             source=session.source,
-            words=session.source is not None,
+            words=session.words,
             modes=list(_MODES),
             features=list(messages.FEATURES),
             document=self._mirror.document(session.document),
@@ -274,7 +286,7 @@ class SceneAnswers:
 
         self._select_by(client, request, memory, draft)
         selection = self._selection()
-        stages["whole"] = _milliseconds(began)
+        stages |= {name: round(1e3 * spent, 1) for name, spent in self._session.seconds.items()}
         self._send_selected(client, request, "final", selection, stages, began)
 
     def _select_by(
@@ -428,7 +440,7 @@ class SceneAnswers:
                 fields = msgspec.structs.asdict(given)
                 if "ids" in fields:
                     fields["ids"] = tuple(fields["ids"])
-                command = STATE_COMMANDS[request.name](**fields)
+                command = COMMANDS[request.name](**fields)
         session.do(command, author=client.author, revision=request.revision)
 
     def _selected_mask(self, what: str) -> Mask:
@@ -503,7 +515,8 @@ class SceneAnswers:
         match given:
             case messages.Export():
                 ids = None if given.ids is None else tuple(given.ids)
-                path = session.export(given.what, given.name, ids=ids, format=given.format)
+                name = given.name if given.format is None else f"{given.name}.{given.format}"
+                path = session.export(given.what, name, ids=ids)
                 return (jobs.zipped(path) if path.is_dir() else path), "exported"
             case messages.SaveLayer():
                 session.save_layer(given.name)
@@ -610,21 +623,6 @@ def _memory(client: Client) -> _Memory:
 
 def _milliseconds(began: float) -> float:
     return round(1e3 * (time.perf_counter() - began), 1)
-
-
-def combined(
-    confidence: Confidence, base: Confidence | None, mode: messages.SelectMode
-) -> Confidence:
-    """A mask added to, removed from or intersected with an earlier one."""
-    if mode == "set":
-        return confidence
-    if base is None:
-        return confidence if mode == "add" else np.zeros_like(confidence)
-    if mode == "add":
-        return np.maximum(base, confidence)
-    if mode == "remove":
-        return np.minimum(base, 255 - confidence)
-    return np.minimum(base, confidence)
 
 
 def _triple(point: Any) -> tuple[float, float, float] | None:

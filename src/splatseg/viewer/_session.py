@@ -1,0 +1,691 @@
+"""A session: one scene segmented by hand, from Python and from the page by the same methods.
+
+    with splatseg.viewer.open_session("toys") as session:
+        session.select(ViewPrompt(view=session.scene.views[0], points=[[400, 300]]))
+        session.do(commands.Keep("mug"))
+        session.save_layer("things")
+
+What is done is in the journal when the method returns. A session is for one thread.
+"""
+
+import hashlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from types import EllipsisType
+from typing import Any, Literal, Self, cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from splatseg.core import (
+    UNLABELLED,
+    Edited,
+    InstanceTree,
+    Labels,
+    Scene,
+    Selection,
+    apply_rows,
+)
+from splatseg.errors import InputError, ShapeError, quoted
+from splatseg.io.scene import load_scene, save_scene_layer, scene_layer_names
+from splatseg.io.scene_folder import scene_path
+from splatseg.io.splats import read_splats
+from splatseg.neighbours import Subset
+from splatseg.prompting.graph import holes
+from splatseg.prompting.pipeline import growth_radius
+from splatseg.prompting.prompts import AxisBox, Ball, Lasso, SelectionPrompt, Similar, ViewPrompt
+from splatseg.render import BackendName
+from splatseg.selection import components
+from splatseg.tasks.work import SILENT, Observer
+from splatseg.viewer import _products as products
+from splatseg.viewer._journal import Journal
+from splatseg.viewer._masks import MaskStore
+from splatseg.viewer._selecting import Selecting, bytes_of, selection_of
+from splatseg.viewer._state import (
+    MEMBER,
+    Command,
+    Confidence,
+    Document,
+    Entry,
+    History,
+    Key,
+    Mask,
+    Select,
+    Split,
+    Suggest,
+    changed_keys,
+    free_name,
+    keys_of,
+)
+
+VIEW_FOLDER = "view"
+"""Folder of a scene that holds the journal."""
+
+Mode = Literal["set", "add", "remove", "intersect"]
+SplitBy = Literal["parts", "tree", "plane"]
+Callback = Callable[[Document, Document, str], None]
+
+_MAX_PROMPTS = 64
+"""Most prompts of a selection that are recorded, the last."""
+
+_MAX_NEIGHBOURS = 64
+"""Most neighbours that are asked whether they are outside when a selection shrinks."""
+
+
+def open_session(
+    scene: Scene | Path | str,
+    *,
+    folder: Path | str | None = None,
+    backend: BackendName = "auto",
+    observer: Observer = SILENT,
+) -> "Session":
+    """Open a scene to segment it by hand; what was done before is there again.
+
+    Args:
+        scene: A scene, its folder, or a splat file.
+        folder: Where the journal lies. None takes the folder ``view`` of the scene; of a scene
+            without a folder everything stays in memory.
+        backend: Rendering backend.
+        observer: Is told of what is opened, and of what was wrong with the journal.
+
+    Raises:
+        InputError: If there is no such scene, or another process has it open.
+        OutputError: If the journal cannot be written.
+    """
+    if not isinstance(scene, Scene):
+        path = Path(scene)
+        scene = Scene(gaussians=read_splats(path)) if path.is_file() else load_scene(path)
+    place = None if folder is None else Path(folder)
+    if place is None and scene.root is not None:
+        place = scene_path(scene.root, VIEW_FOLDER)
+    journal = None
+    if place is not None:
+        count = len(scene.gaussians)
+        journal = Journal(place, gaussians=count, digest=_digest_of(scene))
+        for note in journal.notes:
+            observer.note(note)
+    return Session(scene, journal=journal, folder=place, backend=backend, observer=observer)
+
+
+class Session:
+    """A scene, its document, and what can be done with both; a context that closes it.
+
+    `open_session` makes it.
+
+    Args:
+        scene: The scene; it stays as it is.
+        journal: Where commands are written; None keeps them in memory.
+        folder: Where exports go of a scene without a folder of its own.
+        backend: Rendering backend.
+        observer: Is told of what is opened.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        journal: Journal | None = None,
+        folder: Path | None = None,
+        backend: BackendName = "auto",
+        observer: Observer = SILENT,
+    ) -> None:
+        self._scene = scene
+        self._journal = journal
+        self._folder = folder
+        self._backend: BackendName = backend
+        self._observer = observer
+        self._masks = MaskStore(len(scene.gaussians)) if journal is None else journal.masks
+        self._history = History() if journal is None else journal.history
+        self._opened_at = self.revision
+        self._changes: dict[Key, dict[str, int]] = {}
+        self._callbacks: list[Callback] = []
+        self._selecting = Selecting(scene, backend=backend, observer=observer)
+        self._owners = products.Owners(len(scene.gaussians), self._masks)
+        self._edited: tuple[tuple[object, ...], Edited] | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Release what it holds, and the lock of the journal."""
+        self._selecting.close()
+        if self._journal is not None:
+            self._journal.close()
+
+    @property
+    def scene(self) -> Scene:
+        """The scene, without edits."""
+        return self._scene
+
+    @property
+    def document(self) -> Document:
+        """As it is now."""
+        return self._history.document
+
+    @property
+    def revision(self) -> int:
+        """Of the document."""
+        return self.document.revision
+
+    @property
+    def history(self) -> History:
+        """What was done and undone. `do`, `undo` and `redo` of the session change it."""
+        return self._history
+
+    @property
+    def masks(self) -> MaskStore:
+        """Masks by their content."""
+        return self._masks
+
+    @property
+    def labels_of_commands(self) -> tuple[str, ...]:
+        """What is done, in words, the first first."""
+        return tuple(entry.label for entry in self._history.entries)
+
+    @property
+    def undo_label(self) -> str | None:
+        """What undoing would take back; None where there is nothing."""
+        return self._history.undo_label
+
+    @property
+    def redo_label(self) -> str | None:
+        """What redoing would do again; None where there is nothing."""
+        return self._history.redo_label
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What should be known of how the journal was opened."""
+        return () if self._journal is None else self._journal.notes
+
+    @property
+    def source(self) -> str | None:
+        """What of the scene answers clicks, such as ``layer masks``; None where nothing does.
+
+        Clicks then select what is connected and of about the same colour.
+        """
+        return self._selecting.source
+
+    @property
+    def words(self) -> bool:
+        """Whether the scene has a layer that answers words."""
+        return self._selecting.words is not None
+
+    @property
+    def seconds(self) -> Mapping[str, float]:
+        """Of the last selection by stage, see `splatseg.tasks.Selected`."""
+        return self._selecting.seconds
+
+    @property
+    def selected(self) -> Selection | None:
+        """What is selected; None where nothing is."""
+        mask = self.document.selection
+        return None if mask is None else selection_of(self._masks.get(mask))
+
+    @property
+    def visible(self) -> NDArray[np.bool_]:
+        """(n,) which Gaussians of the scene are shown.
+
+        Not those that were removed, nor those of hidden objects; where objects are isolated,
+        theirs alone.
+        """
+        document = self.document
+        ids, _ = self._owners.of(document.objects)
+        hidden = [one.id for one in document.objects if not one.visible]
+        shown = ~np.isin(ids, hidden)
+        if document.isolated:
+            shown &= np.isin(ids, document.isolated)
+        for edit in document.edits:
+            if edit.kind == "remove":
+                shown &= self._masks.get(edit.mask) < MEMBER
+        return shown
+
+    def owners(self) -> NDArray[np.int32]:
+        """(n,) the id of the object that each Gaussian belongs to, -1 for none.
+
+        Of several objects it is the one that is surest of it, of equally sure ones the later.
+        """
+        return self._owners.of(self.document.objects)[0]
+
+    def confidence(self, mask: Mask) -> Confidence:
+        """(n,) uint8 confidences of a mask, 0 to 255; from 128 on a Gaussian belongs to it."""
+        return self._masks.get(mask)
+
+    def subscribe(self, callback: Callback) -> Callable[[], None]:
+        """Be told of each change: the document before, the document after, the author.
+
+        Returns:
+            A function that ends it.
+        """
+        self._callbacks.append(callback)
+
+        def end() -> None:
+            if callback in self._callbacks:
+                self._callbacks.remove(callback)
+
+        return end
+
+    # Commands.
+
+    def do(self, command: Command, *, author: str = "", revision: int | None = None) -> Document:
+        """Do a command, and write it down.
+
+        Args:
+            command: See `splatseg.viewer.commands`.
+            author: Who does it.
+            revision: The document that the author saw. Where another author changed what the
+                command is about since, it is refused. None does not ask.
+
+        Raises:
+            InputError: If it cannot be done; a sentence says why.
+            OutputError: If it cannot be written down; nothing was done.
+        """
+        if revision is not None:
+            self._check_unchanged(command, author, revision)
+        entry = self._history.checked(command, self._masks, author)
+        return self._written(entry.after, author, lambda: self._history.do(entry), entry=entry)
+
+    def undo(self, author: str = "") -> Document:
+        """Take the last command back, whoever did it.
+
+        Raises:
+            InputError: If there is nothing to undo.
+        """
+        self._history.check_undo()
+        before = self._history.entries[-1].before
+        return self._written(before, author, self._history.undo)
+
+    def redo(self, author: str = "") -> Document:
+        """Do again what was undone last.
+
+        Raises:
+            InputError: If there is nothing to redo.
+        """
+        self._history.check_redo()
+        return self._written(self._history.next_redo.after, author, self._history.redo, redo=True)
+
+    def _written(
+        self,
+        after: Document,
+        author: str,
+        change: Callable[[], Document],
+        *,
+        entry: Entry | None = None,
+        redo: bool = False,
+    ) -> Document:
+        """Write a change down, make it, and tell of it."""
+        before = self.document
+        after = self._history.numbered(after)
+        if self._journal is not None:
+            command = None if entry is None else entry.command
+            self._journal.write(command, author=author, after=after, redo=redo)
+        change()
+        for key in changed_keys(before, after):
+            self._changes.setdefault(key, {})[author] = after.revision
+        for callback in tuple(self._callbacks):
+            callback(before, self.document, author)
+        return self.document
+
+    def _check_unchanged(self, command: Command, author: str, revision: int) -> None:
+        for key in keys_of(command):
+            changes = self._changes.get(key, {"": self._opened_at})
+            last = max((at for who, at in changes.items() if not who or who != author), default=0)
+            if last > revision:
+                kind, id = key
+                name = "" if kind == "selection" else f" {id}"
+                raise InputError(
+                    f"{kind}{name}: it was changed since you saw it; look at it and try again."
+                )
+
+    # Selecting.
+
+    def prepare(self) -> None:
+        """Open all that a click needs, so that the first one takes no longer than others."""
+        self._selecting.prepare()
+
+    def reopen(self) -> None:
+        """Let go of what answers clicks and words; the next one opens what is there then."""
+        self._selecting.close()
+
+    def select(
+        self,
+        prompts: SelectionPrompt | Sequence[SelectionPrompt] | str,
+        *,
+        mode: Mode = "set",
+        level: float | None = 0.5,
+        base: Mask | EllipsisType | None = ...,
+        draft: Callable[[Confidence], None] | None = None,
+        author: str = "",
+    ) -> Document:
+        """Select what prompts mean.
+
+        Args:
+            prompts: What is shown in views, places, more of the same; or words.
+            mode: What becomes of what was selected: set replaces it, add adds to it, remove takes
+                from it, intersect keeps what is in both.
+            level: 0 for the finest parts, 0.5 for objects, 1 for groups; None lets the source
+                choose.
+            base: What was selected, for the mode; left out it is the present selection.
+            draft: Is called with confidences (n,) before they are cleaned, 0 to 255.
+            author: Who does it.
+
+        Returns:
+            The document; without a selection, where nothing is left of it.
+
+        Raises:
+            InputError: If prompts show nothing, or there is nothing to take from.
+        """
+        if level is not None and not 0 <= level <= 1:
+            raise InputError(f"level: expected a number from 0 to 1, got {level:g}.")
+        under = self.document.selection if isinstance(base, EllipsisType) else base
+        if under is None and mode in ("remove", "intersect"):
+            raise InputError(f"{mode}: expected a selection, got none; select something first.")
+        below = None if under is None or mode == "set" else self._masks.get(under)
+
+        def tell(selection: Selection) -> None:
+            if draft is not None:
+                draft(combined(bytes_of(selection), below, mode))
+
+        if isinstance(prompts, str):
+            made, record = self._selecting.find_words(prompts)
+            tell(made)
+        else:
+            one = isinstance(prompts, ViewPrompt | AxisBox | Ball | Lasso | Similar)
+            given = (cast("SelectionPrompt", prompts),) if one else tuple(prompts)
+            made, record = self._selecting.select(given, level=level, draft=tell)
+        earlier = self.document.prompt if under == self.document.selection else None
+        record = _joined_record(record, None if below is None else earlier, mode)
+        mask = self._masks.put(combined(bytes_of(made), below, mode))
+        return self.do(Select(mask if mask.count else None, record), author=author)
+
+    def similarity(self, words: str) -> NDArray[np.float32]:
+        """(n,) how likely words mean each Gaussian, in [0, 1].
+
+        Raises:
+            InputError: If no layer answers words, or nothing is known of these.
+        """
+        return self._selecting.similarity(words).numpy()
+
+    def hint(self, selection: Mask | None = None) -> tuple[float, float, str] | None:
+        """Where the next click would help most: x and y in pixels of a view, and its name.
+
+        Args:
+            selection: Of what; None takes the present selection.
+
+        Returns:
+            None where nothing is selected, nothing is uncertain, or the scene has no views.
+        """
+        mask = selection or self.document.selection
+        if mask is None:
+            return None
+        return self._selecting.hint(torch.from_numpy(np.array(self.confidence(mask))) / 255)
+
+    def grow(self, factor: float = 1.0, *, author: str = "") -> Document:
+        """Add what is near to the selection.
+
+        Args:
+            factor: How near, in median distances of its Gaussians to the next one.
+            author: Who does it.
+
+        Raises:
+            InputError: If nothing is selected.
+        """
+        values, subset, radius = self._around(factor)
+        near = subset.near(radius).numpy() & (values < MEMBER)
+        return self._reselect(np.where(near, 255, values), "grow", factor, author)
+
+    def shrink(self, factor: float = 1.0, *, author: str = "") -> Document:
+        """Take what is near to the outside off the selection; `factor` as in `grow`.
+
+        Raises:
+            InputError: If nothing is selected, or nothing would be left.
+        """
+        values, subset, radius = self._around(factor)
+        rows = torch.nonzero(subset.members).squeeze(1)
+        index = self._selecting.neighbours.index
+        lists = index.others_within(radius, rows=rows, max_neighbours=_MAX_NEIGHBOURS)
+        outside = ~subset.members[lists.indices.long()]
+        rim = rows[torch.unique(lists.queries[outside].long())].numpy()
+        smaller = values.copy()
+        smaller[rim] = 0
+        if not (smaller >= MEMBER).any():
+            raise InputError("shrink: nothing would be left of the selection.")
+        return self._reselect(smaller, "shrink", factor, author)
+
+    def fill_holes(self, *, author: str = "") -> Document:
+        """Add small gaps within the selection.
+
+        Raises:
+            InputError: If nothing is selected.
+        """
+        values = self._selected_values("fill holes")
+        members = Selection(mask=torch.from_numpy(values >= MEMBER))
+        found = holes(self._selecting.neighbours.graph, members).mask.numpy()
+        return self._reselect(np.where(found, 255, values), "fill_holes", None, author)
+
+    def _selected_values(self, what: str) -> Confidence:
+        if self.document.selection is None:
+            raise InputError(f"{what}: expected a selection, got none; select something first.")
+        return self._masks.get(self.document.selection)
+
+    def _around(self, factor: float) -> tuple[Confidence, Subset, float]:
+        """The selection, and a distance of so many times that of its Gaussians."""
+        if not 0 < factor <= 100:
+            raise InputError(f"factor: expected more than 0 and at most 100, got {factor:g}.")
+        values = self._selected_values("grow or shrink")
+        index = self._selecting.neighbours.index
+        members = torch.from_numpy(values >= MEMBER)
+        subset = Subset(index, members)
+        radius = growth_radius(subset, 0.5)
+        if not radius > 0:
+            # One Gaussian, or several in one place: the distance to the next one of the scene.
+            rows = torch.nonzero(members).squeeze(1)
+            radius = float(index.nearest_others(1, rows=rows).distances.max())
+        return values, subset, factor * radius
+
+    def _reselect(
+        self, values: NDArray[Any], what: str, factor: float | None, author: str
+    ) -> Document:
+        step: dict[str, Any] = {"kind": what} | ({} if factor is None else {"factor": factor})
+        earlier = self.document.prompt or {}
+        prompts = [*earlier.get("prompts", []), step][-_MAX_PROMPTS:]
+        mask = self._masks.put(values.astype(np.uint8))
+        return self.do(Select(mask, {**earlier, "prompts": prompts}), author=author)
+
+    # Objects.
+
+    def suggest(self, layer: str, *, author: str = "") -> Document:
+        """Suggest the things of a layer: the objects of a tree, or the ids of labels.
+
+        Raises:
+            InputError: If there is no such layer, or it has no things.
+        """
+        found = self._selecting.layer(layer)
+        made = products.suggestions_of(found, self._masks, name=layer)
+        return self.do(Suggest(made), author=author)
+
+    def split(
+        self,
+        id: int,
+        *,
+        by: SplitBy = "parts",
+        plane: Sequence[float] | None = None,
+        author: str = "",
+        revision: int | None = None,
+    ) -> Document:
+        """Make several objects of one; the largest keeps the id, and all get names of their own.
+
+        Args:
+            id: Of the object.
+            by: parts: its connected pieces. tree: the parts that the scene's tree has of it. plane:
+                the two sides of a plane.
+            plane: a, b, c, d of the plane a x + b y + c z + d = 0, world, scene units.
+            author: Who does it.
+            revision: As in `do`.
+
+        Raises:
+            InputError: If it has no two parts.
+        """
+        one = self.document.object(id)
+        confidence = self._masks.get(one.mask)
+        part = self._parts(confidence, by, plane)
+        means = self._scene.gaussians.means.detach().cpu().double().numpy()
+        parts = products.parts_of(part, confidence, means, what=by)
+        taken = {other.name for other in self.document.objects}
+        names = [one.name]
+        for _ in parts[1:]:
+            names.append(free_name(one.name, taken))
+            taken.add(names[-1])
+        masks = tuple(self._masks.put(values) for values in parts)
+        return self.do(Split(id, masks, tuple(names)), author=author, revision=revision)
+
+    def _parts(
+        self, confidence: Confidence, by: SplitBy, plane: Sequence[float] | None
+    ) -> NDArray[np.int64]:
+        """The part of each Gaussian, -1 where that is not known."""
+        gaussians = self._scene.gaussians
+        if (plane is not None) != (by == "plane"):
+            raise InputError("split: expected a plane with by plane, and with it alone.")
+        if by == "parts":
+            members = Selection(mask=torch.from_numpy(confidence >= MEMBER))
+            return components(gaussians, members).numpy()
+        if by == "tree":
+            found = self._selecting.tree()
+            if found is None or not isinstance(found[1], InstanceTree):
+                raise InputError("split: expected a scene with a tree, got one without.")
+            return found[1].cut("part").ids.cpu().long().numpy()
+        values = np.array(plane if plane is not None else (), dtype=np.float64)
+        if values.shape != (4,) or not np.isfinite(values).all() or not values[:3].any():
+            raise InputError(f"plane: expected four numbers a, b, c, d, got {quoted(plane)}.")
+        means = gaussians.means.detach().cpu().double().numpy()
+        return (means @ values[:3] + values[3] > 0).astype(np.int64)
+
+    # What is taken away.
+
+    def labels(self, ids: Iterable[int] | None = None) -> Labels:
+        """The objects as labels: their ids, names, classes and colours, and how they were made.
+
+        Args:
+            ids: Only these objects; None takes all.
+
+        Raises:
+            InputError: If there are none.
+        """
+        return products.labels_of(
+            self.document,
+            self._owners,
+            self._scene,
+            [entry.command for entry in self._history.entries],
+            ids=None if ids is None else tuple(ids),
+        )
+
+    def save_layer(self, name: str) -> Labels:
+        """Save the objects as a layer of the scene; of a scene without a folder, give it only.
+
+        Raises:
+            InputError: If there are no objects, or a layer of this name is there that was not
+                saved here.
+            OutputError: If it cannot be written.
+        """
+        labels = self.labels()
+        root = self._scene.root
+        if root is None:
+            return labels
+        if name in scene_layer_names(root) and self._scene.layers[name].info.method != (
+            products.METHOD
+        ):
+            raise InputError(
+                f"layer: {quoted(name)} is there already and was not saved here; choose another "
+                "name."
+            )
+        save_scene_layer(labels, root, name)
+        return labels
+
+    def export(
+        self, what: products.ExportWhat, name: str, ids: Iterable[int] | None = None
+    ) -> Path:
+        """Write the scene with its edits, or objects of it, into its folder ``exports``.
+
+        Args:
+            what: splat, objects (a file each), points, coco or table.
+            name: Of the file or folder; its ending says the format, PLY without one.
+            ids: Only these objects; None takes everything.
+
+        Returns:
+            What was written.
+
+        Raises:
+            InputError: If there is no such object, or a name is none.
+            OutputError: If it cannot be written.
+        """
+        only = None if ids is None else tuple(ids)
+        labels = None
+        if self.document.objects or only is not None:
+            labels = apply_rows(self.labels(only), self._edits())
+            if only is not None and not bool((labels.ids != UNLABELLED).any()):
+                raise InputError("export: nothing of these objects is left in the scene.")
+        return products.export(
+            self.edited_scene(),
+            labels,
+            products.exports_folder(self._scene, self._folder),
+            what=what,
+            name=name,
+            only=only,
+            backend=self._backend,
+            observer=self._observer,
+        )
+
+    def edited_scene(self) -> Scene:
+        """The scene with its edits; without a folder, unless there are none."""
+        return products.edited_scene(self._scene, self._edits(), self.document.edits)
+
+    def edited_rows(self) -> NDArray[np.int64]:
+        """(m,) of each Gaussian of the edited scene, the row in the scene that it comes from."""
+        return self._edits().rows.numpy()
+
+    def _edits(self) -> Edited:
+        edits = self.document.edits
+        if self._edited is None or self._edited[0] != edits:
+            made = products.edited(self._scene.gaussians, edits, self._masks)
+            self._edited = edits, made
+        return self._edited[1]
+
+
+def combined(new: Confidence, base: Confidence | None, mode: Mode) -> Confidence:
+    """A selection added to, taken from or intersected with an earlier one, as fuzzy sets are.
+
+    Raises:
+        ShapeError: If they are of different scenes.
+    """
+    if base is None or mode == "set":
+        return new
+    if base.shape != new.shape:
+        raise ShapeError(f"base: expected {len(new)} confidences, got {len(base)}.")
+    match mode:
+        case "add":
+            return np.maximum(base, new)
+        case "remove":
+            return np.minimum(base, 255 - new)
+        case "intersect":
+            return np.minimum(base, new)
+
+
+def _joined_record(
+    record: dict[str, Any], earlier: dict[str, Any] | None, mode: Mode
+) -> dict[str, Any]:
+    """The record of prompts behind those that they were combined with."""
+    prompts = [
+        dict(prompt) if mode == "set" else {**prompt, "mode": mode} for prompt in record["prompts"]
+    ]
+    before = (earlier or {}).get("prompts", [])
+    source = record["source"] or (earlier or {}).get("source", "")
+    return {"source": source, "prompts": [*before, *prompts][-_MAX_PROMPTS:]}
+
+
+def _digest_of(scene: Scene) -> str:
+    """Tells the Gaussians of a scene from those of others: a digest of their centres."""
+    means = scene.gaussians.means.detach().cpu().float().contiguous().numpy()
+    return hashlib.blake2b(means.astype("<f4").tobytes(), digest_size=16).hexdigest()
