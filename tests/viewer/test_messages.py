@@ -54,7 +54,9 @@ def test_defaults_are_those_of_the_protocol() -> None:
     assert (drawn.mode, drawn.only, drawn.rest, drawn.ids) == ("colour", None, False, False)
     assert isinstance(selected, messages.SelectRequest)
     assert (selected.level, selected.mode, selected.width, selected.view) == (0.5, "set", 12, None)
-    assert selected.points == [(1, 2)] and selected.negative == [] and selected.text == ""
+    assert selected.points == [(1, 2)]
+    assert selected.negative == []
+    assert selected.text == ""
 
 
 REFUSED = {
@@ -263,7 +265,8 @@ def test_words_that_python_reserves_are_written_as_the_protocol_has_them() -> No
         edits=None, isolated=None, undo="Select", redo=None, author="3",
     )  # fmt: skip
     said = json.loads(messages.form(made))
-    assert said["type"] == "patch" and (said["from"], said["to"]) == (1, 2)
+    assert said["type"] == "patch"
+    assert (said["from"], said["to"]) == (1, 2)
     row = messages.ObjectInfo(
         id=1, name="</script>", class_name="cup", colour=(1, 2, 3), visible=True, locked=False,
         count=5, confidence=1.0, source="", centre=(0, 0, 0), radius=1,

@@ -217,9 +217,7 @@ class SceneAnswers:
         mask = self._session.document.selection
         return None if mask is None else self._session.confidence(mask)
 
-    def _shown(
-        self, request: messages.DrawRequest | messages.Still
-    ) -> NDArray[np.bool_] | None:
+    def _shown(self, request: messages.DrawRequest | messages.Still) -> NDArray[np.bool_] | None:
         only = request.only if isinstance(request, messages.DrawRequest) else None
         if only is None:
             return self._current_look().shown
@@ -230,7 +228,7 @@ class SceneAnswers:
         if words:
             return self._session.similarity(words)
         selection = self._selection()
-        return None if selection is None else selection / np.float32(255)
+        return None if selection is None else selection.astype(np.float32) / 255
 
     def _current_look(self) -> "_Look":
         revision = self._session.document.revision
@@ -280,14 +278,14 @@ class SceneAnswers:
 
         def draft(confidence: Confidence) -> None:
             stages["draft"] = _milliseconds(began)
-            self._send_selected(client, request, "draft", confidence, stages, began)
+            self._send_selected(client, request, "draft", confidence, stages=stages, began=began)
             if client.camera is not None and not client.busy:
                 self._send_picture(client, client.camera, confidence)
 
         self._select_by(client, request, memory, draft)
         selection = self._selection()
         stages |= {name: round(1e3 * spent, 1) for name, spent in self._session.seconds.items()}
-        self._send_selected(client, request, "final", selection, stages, began)
+        self._send_selected(client, request, "final", selection, stages=stages, began=began)
 
     def _select_by(
         self,
@@ -355,6 +353,7 @@ class SceneAnswers:
         request: messages.SelectRequest,
         stage: messages.Stage,
         confidence: Confidence | None,
+        *,
         stages: Mapping[str, float],
         began: float,
     ) -> None:

@@ -92,9 +92,7 @@ class FittingWatch:
         self._worker = worker
         self._ended = threading.Event()
         self._mark = fitting.mark
-        self._thread = threading.Thread(
-            target=self._watch, name="splatseg view: fit", daemon=True
-        )
+        self._thread = threading.Thread(target=self._watch, name="splatseg view: fit", daemon=True)
 
     def __enter__(self) -> Self:
         self._thread.start()

@@ -172,9 +172,11 @@ class Guard:
             return
         status, text = self._refusal(scope)
         if status:
-            await (_refuse_socket(send) if scope["type"] == "websocket" else self._refuse(
-                send, status, text
-            ))
+            await (
+                _refuse_socket(send)
+                if scope["type"] == "websocket"
+                else self._refuse(send, status, text)
+            )
             return
         await self._app(scope, receive, self._with_headers(send))
 

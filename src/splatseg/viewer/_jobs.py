@@ -1,5 +1,6 @@
-"""Long work that a page asks for: in the worker's thread, which answers between its steps, or in a
-process of its own.
+"""Long work that a page asks for: in the worker's thread, or in a process of its own.
+
+In the thread, the worker answers others between two steps of it.
 """
 
 import contextlib
@@ -7,7 +8,7 @@ import subprocess
 import sys
 import threading
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -38,7 +39,7 @@ class Relay(Observer):
         """Whose work goes on; None where nobody is to be told."""
 
     @contextlib.contextmanager
-    def telling(self, job: Job) -> Iterator[None]:
+    def telling(self, job: Job) -> Generator[None]:
         """Tell this job's page, within the block."""
         before, self.job = self.job, job
         try:
@@ -219,4 +220,3 @@ def _end_if_cancelled(job: Job, process: "subprocess.Popen[str]") -> None:
             return
         with contextlib.suppress(subprocess.TimeoutExpired):
             process.wait(timeout=_POLL_SECONDS)
-

@@ -355,7 +355,7 @@ def _listen(host: str, port: int) -> socket.socket:
         raise InputError(
             f"port: expected a free port of {host}, got {port} ({error}); 0 takes a free one."
         ) from error
-    listening.setblocking(False)
+    listening.settimeout(0)
     return listening
 
 

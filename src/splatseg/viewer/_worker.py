@@ -370,7 +370,7 @@ class Worker:
             work()
         except SplatsegError as error:
             client.send(error_message(error, **about))
-        except Exception:  # the other pages, and the next message, are not to suffer
+        except Exception:  # noqa: BLE001  (other pages and the next message are not to suffer)
             _log.exception("an answer failed")
             text = "something is wrong in the server, which has written it to its output"
             client.send(messages.Error(text=text, **about))  # pyright: ignore[reportArgumentType]
@@ -475,7 +475,7 @@ class Worker:
             self.end_job(job, messages.Error(text="cancelled", id=job.id))
         except SplatsegError as error:
             self.end_job(job, error_message(error, id=job.id))
-        except Exception:
+        except Exception:  # noqa: BLE001  (as above)
             _log.exception("a job failed")
             text = "something is wrong in the server, which has written it to its output"
             self.end_job(job, messages.Error(text=text, id=job.id))
