@@ -3,7 +3,8 @@
 import json
 import struct
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -42,7 +43,9 @@ def write_scene(folder: Path) -> Path:
     centres = np.array([[-1, 0, 0], [1, 0, 0], [0, 3, 1.5]])
     ways = rng.normal(size=(3, EACH, 3))
     ways /= np.linalg.norm(ways, axis=2, keepdims=True)
-    means = (centres[:, None] + 0.4 * ways * rng.uniform(0, 1, (3, EACH, 1)) ** (1 / 3)).reshape(-1, 3)
+    means = (centres[:, None] + 0.4 * ways * rng.uniform(0, 1, (3, EACH, 1)) ** (1 / 3)).reshape(
+        -1, 3
+    )
     colours = np.repeat(np.array([RED, BLUE, GREEN]), EACH, axis=0)
     count = len(means)
     gaussians = Gaussians(
@@ -58,8 +61,8 @@ def write_scene(folder: Path) -> Path:
     view = View(name="first", camera=camera(), image=photograph)
     scene = Scene(gaussians=gaussians, views=(view,), up=(0.0, 0.0, 1.0))
     save_scene(scene, folder)
-    ids = torch.arange(3).repeat_interleave(EACH)
-    info = LayerInfo(method="hand", instances={i: InstanceFacts() for i in range(3)})
+    ids = 1 + torch.arange(3).repeat_interleave(EACH)
+    info = LayerInfo(method="hand", instances={i: InstanceFacts() for i in (1, 2, 3)})
     layer = Labels(ids=ids.int(), confidence=torch.ones(count), info=info)
     save_scene_layer(layer, folder, "things")
     return folder
@@ -106,8 +109,9 @@ def unpacked_ids(data: bytes) -> NDArray[np.uint16]:
 class Page:
     """What the page does, over the socket."""
 
-    def __init__(self, socket: ClientConnection) -> None:
-        self.socket = socket
+    def __init__(self, **arguments: Any) -> None:
+        self._stack = ExitStack()
+        self.socket: ClientConnection = self._stack.enter_context(connect(**arguments))
         self.heard: list[Any] = []
         """Everything that came: objects of text messages, bytes of others."""
 
@@ -115,7 +119,7 @@ class Page:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.socket.close()
+        self._stack.close()
 
     def send(self, type: str, **fields: Any) -> None:
         self.socket.send(json.dumps({"type": type, **fields}))
@@ -183,25 +187,31 @@ class Page:
         return self.next("error", command=name)
 
 
-def logged_in(server: Any) -> httpx.Client:
+def base_url(server: Any) -> str:
+    """Where the server is, without a slash at the end."""
+    return server.url.partition("#")[0].partition("?")[0].rstrip("/")
+
+
+@contextmanager
+def logged_in(server: Any) -> Iterator[httpx.Client]:
     """An HTTP client with the cookie."""
-    base = server.url.partition("#")[0].partition("?")[0].rstrip("/")
-    client = httpx.Client(base_url=base)
-    answer = client.post("/login", json={"token": server.access.token}, headers={"origin": base})
-    assert answer.status_code == 204
-    return client
+    base = base_url(server)
+    with httpx.Client(base_url=base) as client:
+        token = {"token": server.access.token}
+        answer = client.post("/login", json=token, headers={"origin": base})
+        assert answer.status_code == 204
+        yield client
 
 
 def opened(server: Any, *, hello: bool = True) -> Page:
     """A page that has said hello and has the state, as `page.heard[0]`."""
-    base = f"{server.access.host}:{server.access.port}"
-    socket = connect(
-        f"ws://{base}/socket",
-        origin=f"http://{base}",
+    base = base_url(server)
+    page = Page(
+        uri=f"{base.replace('http', 'ws')}/socket",
+        origin=base,
         additional_headers={"Cookie": f"{server.access.cookie}={server.access.token}"},
         max_size=None,
     )
-    page = Page(socket)
     if hello:
         page.send("hello", version=1)
         page.next("state")

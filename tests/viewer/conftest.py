@@ -6,11 +6,12 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 
 from splatseg.viewer import _server
 from splatseg.viewer._server import ViewServer, serve
-from support.viewer import Page, opened, write_scene
+from support.viewer import Page, logged_in, opened, write_scene
 
 PAGE = "<!doctype html><title>splatseg</title>"
 
@@ -62,4 +63,11 @@ def server(serving) -> ViewServer:
 def page(server) -> Iterator[Page]:
     """A page of the server that has the state."""
     with opened(server) as found:
+        yield found
+
+
+@pytest.fixture
+def client(server) -> Iterator[httpx.Client]:
+    """A browser that has logged in."""
+    with logged_in(server) as found:
         yield found

@@ -19,7 +19,6 @@ from support.viewer import (
     RED_PIXEL,
     WIDTH,
     json_camera,
-    logged_in,
     opened,
 )
 
@@ -39,7 +38,8 @@ def test_hello_is_answered_with_all_that_is_to_be_shown(page) -> None:
     assert (view["name"], view["width"], view["height"]) == ("first", WIDTH, HEIGHT)
     assert (view["fx"], view["cx"], view["split"], view["photograph"]) == (90, 48, "train", True)
     assert state["layers"] == ["things"]
-    assert state["document"]["objects"] == [] and state["document"]["selection"] is None
+    assert state["document"]["objects"] == []
+    assert state["document"]["selection"] is None
     assert (state["undo"], state["redo"], state["clients"], state["me"]) == (None, None, 1, 1)
     assert state["fitting"] is None
     assert "colour" in state["modes"]
@@ -57,7 +57,9 @@ def test_the_page_is_told_when_the_first_click_is_quick(server) -> None:
 
 def test_pictures_are_those_of_the_camera(page) -> None:
     frame = page.still(5)
-    assert frame.size == (WIDTH, HEIGHT) and frame.rest and frame.scale == 1
+    assert frame.size == (WIDTH, HEIGHT)
+    assert frame.rest
+    assert frame.scale == 1
     assert near(frame.rgb(*RED_PIXEL), 230, 26, 26)
     assert near(frame.rgb(*BLUE_PIXEL), 26, 26, 230)
     assert near(frame.rgb(*NOTHING), 0, 0, 0)
@@ -70,7 +72,8 @@ def test_pictures_are_those_of_the_camera(page) -> None:
 def test_while_it_moves_pictures_are_smaller_but_not_below_their_floor(page) -> None:
     page.draw(1, width=960, height=720, focal=900)
     frame = page.frame(1)
-    assert not frame.rest and 0.4 <= frame.scale <= 1
+    assert not frame.rest
+    assert 0.4 <= frame.scale <= 1
     assert frame.size[0] == pytest.approx(960 * frame.scale, abs=1)
 
 
@@ -131,7 +134,9 @@ def test_a_click_is_answered_twice_and_drawn(page) -> None:
     patch = next(one for one in page.heard if isinstance(one, dict) and one["type"] == "patch")
     assert patch["selection"]["count"] == final["count"]
     np.testing.assert_allclose(patch["selection"]["centre"], [-1, 0, 0], atol=0.2)
-    assert (patch["from"], patch["to"]) == (0, 1) and patch["undo"] and patch["redo"] is None
+    assert (patch["from"], patch["to"]) == (0, 1)
+    assert patch["undo"]
+    assert patch["redo"] is None
     # The document changed: the last camera is drawn again, with the tint.
     tinted = page.still(2)
     assert tinted.rgb(*RED_PIXEL) != before.rgb(*RED_PIXEL)
@@ -211,24 +216,30 @@ def test_what_shows_nothing_is_said_with_its_gesture(page, kind, fields, words) 
 
 def test_commands_change_the_document_of_all(server, page) -> None:
     with opened(server) as other:
-        assert page.next("clients")["n"] == 2 and other.heard[0]["clients"] == 2
+        assert page.next("clients")["n"] == 2
+        assert other.heard[0]["clients"] == 2
         page.select(1, points=[RED_PIXEL])
         kept = page.command("keep", name="mug", class_name="cup")
         heard = other.next("patch", to=kept["to"])
-        assert heard["objects"] == kept["objects"] and heard["author"] == "1"
+        assert heard["objects"] == kept["objects"]
+        assert heard["author"] == "1"
         (mug,) = kept["objects"]
         assert (mug["name"], mug["class"], mug["visible"], mug["locked"]) == (
             "mug", "cup", True, False,
         )  # fmt: skip
         np.testing.assert_allclose(mug["centre"], [-1, 0, 0], atol=0.2)
         assert 0.2 < mug["radius"] < 0.6
-        assert kept["selection"] is None and kept["undo"] == "Keep mug"
+        assert kept["selection"] is None
+        assert kept["undo"] == "Keep mug"
         other.send("command", name="rename", arguments={"id": mug["id"], "name": "jug"})
         renamed = page.next("patch", to=kept["to"] + 1)
-        assert renamed["objects"][0]["name"] == "jug" and renamed["author"] == "2"
-        assert renamed["gone"] == [] and renamed["order"] is None
+        assert renamed["objects"][0]["name"] == "jug"
+        assert renamed["author"] == "2"
+        assert renamed["gone"] == []
+        assert renamed["order"] is None
         undone = page_undo(page)
-        assert undone["objects"][0]["name"] == "mug" and undone["redo"] == "Rename mug"
+        assert undone["objects"][0]["name"] == "mug"
+        assert undone["redo"] == "Rename mug"
         other.next("patch", to=undone["to"])
         other.send("redo")
         assert page.next("patch")["objects"][0]["name"] == "jug"
@@ -245,7 +256,8 @@ def test_undo_goes_back_over_selections_to_the_start(page) -> None:
     page.select(2, points=[BLUE_PIXEL])
     assert page_undo(page)["selection"]["centre"][0] == pytest.approx(-1, abs=0.2)
     patch = page_undo(page)
-    assert patch["selection"] is None and patch["undo"] is None
+    assert patch["selection"] is None
+    assert patch["undo"] is None
     page.send("undo")
     assert "undo" in page.next("error")["text"]
 
@@ -282,9 +294,11 @@ def test_objects_are_organised(page) -> None:
     assert "locked" in page.refused("delete", ids=[red])["text"]
     page.command("set_locked", ids=[red], locked=False)
     joined = page.command("join", ids=[red, blue], name="pair")
-    assert joined["gone"] == [blue] and joined["objects"][0]["count"] > EACH * 1.5
+    assert joined["gone"] == [blue]
+    assert joined["objects"][0]["count"] > EACH * 1.5
     split = page.command("split", id=red, by="parts")
-    assert len(split["objects"]) == 2 and split["order"] is not None
+    assert len(split["objects"]) == 2
+    assert split["order"] is not None
     selected = page.command("select_object", id=red)
     assert selected["selection"]["count"] == pytest.approx(EACH, abs=20)
     page.command("select_object", ids=[one["id"] for one in split["objects"]], mode="remove")
@@ -324,7 +338,8 @@ def test_suggestions_are_accepted_and_rejected(serving) -> None:
         assert sorted(one["count"] for one in suggestions) == [EACH] * 3
         first, second, third = (one["id"] for one in suggestions)
         taken = page.command("accept", ids=[first])
-        assert len(taken["objects"]) == 1 and len(taken["suggestions"]) == 2
+        assert len(taken["objects"]) == 1
+        assert len(taken["suggestions"]) == 2
         assert page.command("select_suggestion", id=second)["selection"]["count"] == EACH
         assert [one["id"] for one in page.command("reject", ids=[second])["suggestions"]] == [third]
         assert "expected one of those" in page.refused("select_suggestion", id=second)["text"]
@@ -333,7 +348,8 @@ def test_suggestions_are_accepted_and_rejected(serving) -> None:
 def test_depth_is_the_point_under_the_pixel(page) -> None:
     page.send("depth", gesture=1, camera=json_camera(), x=RED_PIXEL[0], y=RED_PIXEL[1])
     point = page.next("point", gesture=1)["point"]
-    assert np.linalg.norm(np.array(point) - [-1, 0, 0]) < 0.7 and point[1] < 0
+    assert np.linalg.norm(np.array(point) - [-1, 0, 0]) < 0.7
+    assert point[1] < 0
     page.send("depth", gesture=2, camera=json_camera(), x=NOTHING[0], y=NOTHING[1])
     assert page.next("point", gesture=2)["point"] is None
     page.send("depth", gesture=3, camera=json_camera(), x=-5, y=1e6)
@@ -375,10 +391,10 @@ def test_a_second_server_of_the_scene_is_refused(server, things, serving) -> Non
         serving(things, port=server.access.port)
 
 
-def test_photographs_are_sent_as_jpeg(server) -> None:
-    client = logged_in(server)
+def test_photographs_are_sent_as_jpeg(client) -> None:
     answer = client.get("/photographs/first", params={"width": 48})
-    assert answer.status_code == 200 and answer.headers["content-type"] == "image/jpeg"
+    assert answer.status_code == 200
+    assert answer.headers["content-type"] == "image/jpeg"
     import cv2
 
     image = cv2.imdecode(np.frombuffer(answer.content, dtype=np.uint8), cv2.IMREAD_COLOR)
@@ -389,26 +405,29 @@ def test_photographs_are_sent_as_jpeg(server) -> None:
 def finished(page, id: int) -> dict:
     """The end of a job; an error shows itself."""
     return page.until(
-        lambda message: isinstance(message, dict)
-        and message["type"] in ("finished", "error")
-        and message["id"] == id
+        lambda message: (
+            isinstance(message, dict)
+            and message["type"] in ("finished", "error")
+            and message["id"] == id
+        )
     )
 
 
-def test_what_is_exported_can_be_fetched(server, page, things) -> None:
+def test_what_is_exported_can_be_fetched(client, page) -> None:
     page.select(1, points=[RED_PIXEL])
     red = page.command("keep", name="red")["objects"][0]
     given = {"what": "splat", "name": "red", "ids": [red["id"]]}
     page.send("job", id=1, name="export", arguments=given)
     file = finished(page, 1)["result"]["file"]
-    answer = logged_in(server).get(f"/exports/{file}")
-    assert answer.status_code == 200 and answer.content.startswith(b"ply")
+    answer = client.get(f"/exports/{file}")
+    assert answer.status_code == 200
+    assert answer.content.startswith(b"ply")
     assert f"element vertex {red['count']}".encode() in answer.content[:200]
     assert "attachment" in answer.headers["content-disposition"]
     page.send("job", id=2, name="export", arguments={"what": "objects", "name": "all"})
     file = finished(page, 2)["result"]["file"]
     assert file == "all.zip"
-    assert logged_in(server).get(f"/exports/{file}").content.startswith(b"PK")
+    assert client.get(f"/exports/{file}").content.startswith(b"PK")
 
 
 def test_a_layer_is_saved_and_listed(page, things) -> None:
@@ -423,12 +442,11 @@ def test_a_layer_is_saved_and_listed(page, things) -> None:
     assert "choose another name" in f"{finished(page, 2)}"
 
 
-def test_pictures_and_films_are_files(server, page) -> None:
+def test_pictures_and_films_are_files(client, page) -> None:
     page.send("job", id=1, name="picture", arguments={"camera": json_camera(), "name": "front"})
     assert finished(page, 1)["result"]["file"] == "front.png"
     page.send("job", id=2, name="picture", arguments={"camera": json_camera(), "name": "front"})
     assert finished(page, 2)["result"]["file"] == "front-2.png"
-    client = logged_in(server)
     assert client.get("/exports/front.png").content[1:4] == b"PNG"
     page.send("job", id=3, name="film", arguments={"camera": json_camera(), "frames": 4})
     assert finished(page, 3)["result"]["file"] == "turntable.mp4"
@@ -473,7 +491,8 @@ def test_an_error_in_an_answer_leaves_the_server_running(page, monkeypatch, capl
         patch.setattr(Drawer, "picture", fail)
         page.draw(1, rest=True)
         error = page.next("error")
-    assert "secret" not in error["text"] and "something is wrong" in error["text"]
+    assert "secret" not in error["text"]
+    assert "something is wrong" in error["text"]
     assert page.still(2).size == (WIDTH, HEIGHT)
 
 
