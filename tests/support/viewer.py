@@ -176,15 +176,15 @@ class Page:
         self.send("select", **{"gesture": gesture, "kind": kind, "camera": json_camera(), **fields})
         return self.next("selected", gesture=gesture, stage="final")
 
-    def command(self, name: str, revision: int | None = None, **arguments: Any) -> dict[str, Any]:
+    def command(self, command: str, /, **arguments: Any) -> dict[str, Any]:
         """A command, to the patch that it makes."""
-        self.send("command", name=name, arguments=arguments, revision=revision)
+        self.send("command", name=command, arguments=arguments)
         return self.next("patch")
 
-    def refused(self, name: str, **arguments: Any) -> dict[str, Any]:
+    def refused(self, command: str, /, **arguments: Any) -> dict[str, Any]:
         """A command that ends in an error."""
-        self.send("command", name=name, arguments=arguments)
-        return self.next("error", command=name)
+        self.send("command", name=command, arguments=arguments)
+        return self.next("error", command=command)
 
 
 def base_url(server: Any) -> str:
