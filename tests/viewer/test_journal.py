@@ -33,21 +33,20 @@ class Written:
 
     def undo(self) -> None:
         self.history.check_undo()
-        after = self.history.entries[-1].before
+        after = self.history.numbered(self.history.entries[-1].before)
         self.journal.write(None, author="", after=after)
         self.history.undo()
 
     def redo(self) -> None:
-        self.journal.write(None, author="", after=self.history.next_redo.after, redo=True)
+        after = self.history.numbered(self.history.next_redo.after)
+        self.journal.write(None, author="", after=after, redo=True)
         self.history.redo()
 
     def take(self, given) -> list[Document]:
         """The documents after each step that could be taken, the first before them."""
         stored(self.masks)
         seen = [self.history.document]
-        for step in given:
-            if done(step, self.do, self):
-                seen.append(self.history.document)
+        seen.extend(self.history.document for step in given if done(step, self.do, self))
         return seen
 
 
@@ -101,17 +100,18 @@ def test_a_journal_killed_at_any_byte_restores_to_a_prefix(tmp_path_factory, giv
     assert (again, none) == (found, ())
 
 
-def test_every_byte_of_a_short_journal(tmp_path) -> None:
-    seen = write(tmp_path / "a", 5)
+def test_what_follows_a_torn_line_stands_on_a_line_of_its_own(tmp_path) -> None:
+    seen = write(tmp_path / "a", 4)
     raw = (tmp_path / "a" / "journal.jsonl").read_bytes()
-    for cut in range(len(raw) + 1):
+    ends = [0, *(i + 1 for i, byte in enumerate(raw) if byte == 10)]
+    cuts = {end + step for end in ends for step in (-2, -1, 0, 1, 2)} | set(range(0, len(raw), 71))
+    for cut in sorted(cut for cut in cuts if 0 <= cut <= len(raw)):
         folder = tmp_path / str(cut)
         shutil.copytree(tmp_path / "a", folder)
         (folder / "journal.jsonl").write_bytes(raw[:cut])
         written = Written(folder)
         complete = max(raw[:cut].count(b"\n") - 1, 0)
         assert written.history.document == seen[complete]
-        # What comes next stands on a line of its own.
         written.take([Select(put(written.masks, 3))])
         written.journal.close()
         assert reopen(folder) == (written.history.document, ())
@@ -442,13 +442,17 @@ def test_a_folder_that_cannot_be_made_is_said(tmp_path) -> None:
     ("name", "arguments", "said"),
     [
         ("remove", {}, "command: expected one of select, keep"),
-        ("rename", {"id": 1}, "rename: expected name"),
+        ("rename", {"id": 1}, "rename: expected a field name"),
         ("rename", {"id": 1, "name": 3}, "name: expected text"),
         ("rename", {"id": 1.5, "name": "a"}, "id: expected a whole number"),
         ("rename", {"id": 1, "name": "a", "names": []}, "rename: expected id, name, got 'names'"),
         ("set_colour", {"ids": [1], "colour": [0, 0, 256]}, "at most 255"),
         ("set_visible", {"ids": 1, "visible": True}, "ids: expected a list"),
-        ("select", {"mask": {"id": "a", "count": -1}}, "count: expected a whole number at least"),
+        (
+            "select",
+            {"mask": {"id": "a", "count": -1}},
+            "count: expected a whole number of at least",
+        ),
         ("apply", {"edit": {"kind": "explode", "mask": {"id": "a", "count": 1}}}, "kind"),
     ],
 )
