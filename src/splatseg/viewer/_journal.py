@@ -232,7 +232,7 @@ class Journal:
             self._append(msgspec.to_builtins(self._header))
             return
         *pieces, torn = raw.split(b"\n")
-        lines = [_line_of(piece, n) for n, piece in enumerate(pieces[1:], start=1)]
+        lines = [_line_of(piece) for piece in pieces[1:]]
         self._replay_all(pieces, lines)
         self._last = _digest(pieces[self._lines])
         if self._lines < len(lines) or torn:
@@ -240,18 +240,17 @@ class Journal:
         self._drop_snapshots(after=self._lines)
 
     def _replay_all(self, pieces: Sequence[bytes], lines: Sequence[_Line | None]) -> None:
-        done = _replay(self._history, lines, self._masks)
+        done = _replay(self._history, lines, self._masks, after=0)
         if any(lines[done:]):
-            snapshot = self._newest_snapshot(pieces, after=done)
+            snapshot, bad = self._newest_snapshot(pieces, after=done), done + 1
             if snapshot is not None:
                 history = History(snapshot.document)
-                rest = _replay(history, lines[snapshot.lines :], self._masks)
+                done = _replay(history, lines, self._masks, after=snapshot.lines)
                 self._history = history
                 self._notes.append(
-                    f"line {done + 1} of the journal is damaged; what was done is restored from "
+                    f"line {bad} of the journal is damaged; what was done is restored from "
                     f"line {snapshot.lines} on, and can be undone to there"
                 )
-                done = snapshot.lines + rest
         self._lines = done
 
     def _drop_rest(self, pieces: Sequence[bytes], lines: Sequence[_Line | None]) -> None:
@@ -366,10 +365,12 @@ def _masks_in(value: object) -> list[Mask]:
     return [mask for name in names for mask in _masks_in(getattr(value, name))]
 
 
-def _replay(history: History, lines: Sequence[_Line | None], masks: MaskStore) -> int:
-    """Do lines again, up to the first that cannot be; how many were done."""
-    for done, line in enumerate(lines):
-        if line is None:
+def _replay(
+    history: History, lines: Sequence[_Line | None], masks: MaskStore, *, after: int
+) -> int:
+    """Do the lines behind so many again, up to the first that cannot be; how many are done."""
+    for done, line in enumerate(lines[after:], start=after):
+        if line is None or line.n != done + 1:
             return done
         try:
             if line.do == _UNDO:
@@ -384,13 +385,12 @@ def _replay(history: History, lines: Sequence[_Line | None], masks: MaskStore) -
     return len(lines)
 
 
-def _line_of(piece: bytes, n: int) -> _Line | None:
-    """A line of a journal; None where it is none, or not the one that belongs there."""
+def _line_of(piece: bytes) -> _Line | None:
+    """A line of a journal; None where it is none."""
     try:
-        line = structured(parse_object(piece, where=JOURNAL_FILE), _Line, where=JOURNAL_FILE)
+        return structured(parse_object(piece, where=JOURNAL_FILE), _Line, where=JOURNAL_FILE)
     except FileFormatError:
         return None
-    return line if line.n == n else None
 
 
 def _header_of(piece: bytes) -> _Header | None:

@@ -17,27 +17,23 @@ from splatseg.core import (
     Edited,
     Gaussians,
     InstanceFacts,
-    InstanceTree,
     Labels,
     Layer,
     LayerInfo,
     Scene,
     Selection,
     Similarity,
-    flat_layer,
 )
 from splatseg.core.rigid import rotation_from_quaternion
 from splatseg.edit import duplicate, recolour, remove, transform
-from splatseg.errors import InputError, visible
+from splatseg.errors import InputError
 from splatseg.io.atomic import named_write_failures, path_inside
 from splatseg.io.scene import check_name
-from splatseg.neighbours import NeighbourIndex
 from splatseg.render import BackendName
 from splatseg.tasks import ExportOptions, export_scene
 from splatseg.tasks.work import EXPORTS_FOLDER, Observer, layer_versions
 from splatseg.viewer._journal import command_to_json
 from splatseg.viewer._state import (
-    MAX_NAME,
     MEMBER,
     Command,
     Confidence,
@@ -45,7 +41,6 @@ from splatseg.viewer._state import (
     Edit,
     Masks,
     Object,
-    Suggestion,
 )
 
 METHOD = "view"
@@ -55,10 +50,6 @@ ExportWhat = Literal["splat", "objects", "points", "coco", "table"]
 
 _LAYER = "objects"
 _SUFFIXES: Mapping[str, str] = {"splat": ".ply", "points": ".ply", "table": ".csv"}
-
-_MIN_PART, _MIN_SHARE = 8, 0.02
-"""Least Gaussians of a part of a split, and least share of those of the thing; what is less goes
-to the part that is nearest."""
 
 
 class Owners:
@@ -255,85 +246,6 @@ def export(
         observer=observer,
     )
     return made.output
-
-
-# Suggestions of a layer, and parts of an object.
-
-
-def suggestions_of(layer: Layer, masks: Masks, *, name: str) -> tuple[Suggestion, ...]:
-    """The things of a layer of labels, or the objects of a tree, the largest first.
-
-    Raises:
-        InputError: If it has none.
-    """
-    support: dict[int, float] = {}
-    if isinstance(layer, InstanceTree):
-        support = {node.id: node.support for node in layer.nodes}
-    labels = flat_layer(layer, None, name=name)
-    if not isinstance(labels, Labels):
-        raise InputError(f"suggest: expected a layer of labels or a tree, {name!r} has no ids.")
-    ids, sure = labels.ids.cpu().numpy(), labels.confidence.cpu().double().numpy()
-    present, counts = np.unique(ids[ids != UNLABELLED], return_counts=True)
-    order = np.lexsort((present, -counts))
-    found: list[Suggestion] = []
-    for number, id in enumerate(int(present[i]) for i in order):
-        own = ids == id
-        values = np.where(own, np.clip(np.rint(255 * sure), MEMBER, 255), 0).astype(np.uint8)
-        # A tree says how much speaks for a node, labels only how sure their Gaussians are.
-        score = support.get(id, float(np.clip(sure[own].mean(), 0, 1)))
-        found.append(
-            Suggestion(
-                id=number,
-                name=_plain_name(labels.info.names.get(id, "")) or f"{name} {id}"[:MAX_NAME],
-                mask=masks.put(values),
-                score=round(score, 6),
-            )
-        )
-    if not found:
-        raise InputError(f"suggest: expected a layer with things, {name!r} has none.")
-    return tuple(found)
-
-
-def _plain_name(name: str) -> str:
-    """A name of a layer as an object may be called; empty where nothing of it is left."""
-    text = visible(name).replace("/", "-").replace("\\", "-").strip()[:MAX_NAME].strip()
-    return "" if text in (".", "..") else text
-
-
-def parts_of(
-    part: NDArray[np.int64], confidence: Confidence, means: NDArray[np.float64], *, what: str
-) -> list[Confidence]:
-    """The Gaussians of a thing shared out among its parts, the largest first.
-
-    Args:
-        part: (n,) number of the part of each Gaussian; -1 for those of which that is not known.
-        confidence: (n,) of the thing.
-        means: (n, 3) centres.
-        what: How it was parted, for the message.
-
-    Raises:
-        InputError: If it has no two parts that are large enough.
-    """
-    rows = np.nonzero(confidence >= MEMBER)[0]
-    own = part[rows]
-    numbers, counts = np.unique(own[own >= 0], return_counts=True)
-    large = counts >= max(_MIN_PART, _MIN_SHARE * len(rows))
-    numbers, counts = numbers[large], counts[large]
-    if len(numbers) < 2:
-        raise InputError(f"split: {what} gives one part only; nothing was changed.")
-    lost = ~np.isin(own, numbers)
-    if lost.any():
-        index = NeighbourIndex(torch.from_numpy(means[rows[~lost]]))
-        nearest = index.nearest(torch.from_numpy(means[rows[lost]]), 1).indices[:, 0]
-        own = own.copy()
-        own[lost] = own[~lost][nearest.numpy()]
-    found: list[Confidence] = []
-    for number in numbers[np.argsort(-counts, kind="stable")]:
-        values = np.zeros_like(confidence)
-        members = rows[own == number]
-        values[members] = confidence[members]
-        found.append(values)
-    return found
 
 
 def edit_records(edits: Sequence[Edit]) -> list[dict[str, Any]]:

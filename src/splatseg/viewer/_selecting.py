@@ -13,7 +13,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatseg.core import Camera, Features, Gaussians, Layer, Scene, Selection, View, VoxelFeatures
+from splatseg.core import (
+    Camera,
+    Features,
+    Gaussians,
+    InstanceTree,
+    Layer,
+    Scene,
+    Selection,
+    View,
+    VoxelFeatures,
+)
 from splatseg.errors import InputError
 from splatseg.prompting.next_click import next_click
 from splatseg.prompting.pipeline import SceneIndex
@@ -178,11 +188,12 @@ class Selecting:
                 found.setdefault(facts.info.method or "", name)
         return next((found[method] for method in _ANSWERING if method in found), None)
 
-    def tree(self) -> tuple[str, Layer] | None:
-        """The first layer that is a tree, and its name."""
+    def tree(self) -> InstanceTree | None:
+        """The first layer that is a tree; None without one."""
         for name in self._work.layer_names:
             if self._work.facts(name).rank == 0:
-                return name, self._work.layer(name)
+                layer = self._work.layer(name)
+                return layer if isinstance(layer, InstanceTree) else None
         return None
 
     def layer(self, name: str) -> Layer:

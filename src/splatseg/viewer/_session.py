@@ -12,7 +12,7 @@ import hashlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import EllipsisType
-from typing import Any, Literal, Self, cast
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -21,27 +21,24 @@ from numpy.typing import NDArray
 from splatseg.core import (
     UNLABELLED,
     Edited,
-    InstanceTree,
     Labels,
     Scene,
     Selection,
     apply_rows,
 )
-from splatseg.errors import InputError, ShapeError, quoted
+from splatseg.errors import InputError, quoted
 from splatseg.io.scene import load_scene, save_scene_layer, scene_layer_names
 from splatseg.io.scene_folder import scene_path
 from splatseg.io.splats import read_splats
-from splatseg.neighbours import Subset
-from splatseg.prompting.graph import holes
-from splatseg.prompting.pipeline import growth_radius
 from splatseg.prompting.prompts import AxisBox, Ball, Lasso, SelectionPrompt, Similar, ViewPrompt
 from splatseg.render import BackendName
-from splatseg.selection import components
 from splatseg.tasks.work import SILENT, Observer
 from splatseg.viewer import _products as products
+from splatseg.viewer import _shaping as shaping
 from splatseg.viewer._journal import Journal
 from splatseg.viewer._masks import MaskStore
 from splatseg.viewer._selecting import Selecting, bytes_of, selection_of
+from splatseg.viewer._shaping import Mode, SplitBy
 from splatseg.viewer._state import (
     MEMBER,
     Command,
@@ -62,15 +59,10 @@ from splatseg.viewer._state import (
 VIEW_FOLDER = "view"
 """Folder of a scene that holds the journal."""
 
-Mode = Literal["set", "add", "remove", "intersect"]
-SplitBy = Literal["parts", "tree", "plane"]
 Callback = Callable[[Document, Document, str], None]
 
 _MAX_PROMPTS = 64
 """Most prompts of a selection that are recorded, the last."""
-
-_MAX_NEIGHBOURS = 64
-"""Most neighbours that are asked whether they are outside when a selection shrinks."""
 
 
 def open_session(
@@ -331,9 +323,10 @@ class Session:
 
     def _check_unchanged(self, command: Command, author: str, revision: int) -> None:
         for key in keys_of(command):
-            changes = self._changes.get(key, {"": self._opened_at})
-            last = max((at for who, at in changes.items() if not who or who != author), default=0)
-            if last > revision:
+            changes = self._changes.get(key, {})
+            others = (at for who, at in changes.items() if not who or who != author)
+            last = max(others, default=self._opened_at)
+            if max(last, self._opened_at) > revision:
                 kind, id = key
                 name = "" if kind == "selection" else f" {id}"
                 raise InputError(
@@ -387,18 +380,18 @@ class Session:
 
         def tell(selection: Selection) -> None:
             if draft is not None:
-                draft(combined(bytes_of(selection), below, mode))
+                draft(shaping.combined(bytes_of(selection), below, mode))
 
         if isinstance(prompts, str):
             made, record = self._selecting.find_words(prompts)
             tell(made)
         else:
             one = isinstance(prompts, ViewPrompt | AxisBox | Ball | Lasso | Similar)
-            given = (cast("SelectionPrompt", prompts),) if one else tuple(prompts)
+            given = (prompts,) if one else tuple(prompts)
             made, record = self._selecting.select(given, level=level, draft=tell)
         earlier = self.document.prompt if under == self.document.selection else None
         record = _joined_record(record, None if below is None else earlier, mode)
-        mask = self._masks.put(combined(bytes_of(made), below, mode))
+        mask = self._masks.put(shaping.combined(bytes_of(made), below, mode))
         return self.do(Select(mask if mask.count else None, record), author=author)
 
     def similarity(self, words: str) -> NDArray[np.float32]:
@@ -433,9 +426,8 @@ class Session:
         Raises:
             InputError: If nothing is selected.
         """
-        values, subset, radius = self._around(factor)
-        near = subset.near(radius).numpy() & (values < MEMBER)
-        return self._reselect(np.where(near, 255, values), "grow", factor, author)
+        values = shaping.grown(self._selected(), self._selecting.neighbours, factor)
+        return self._reselect(values, "grow", factor, author)
 
     def shrink(self, factor: float = 1.0, *, author: str = "") -> Document:
         """Take what is near to the outside off the selection; `factor` as in `grow`.
@@ -443,17 +435,8 @@ class Session:
         Raises:
             InputError: If nothing is selected, or nothing would be left.
         """
-        values, subset, radius = self._around(factor)
-        rows = torch.nonzero(subset.members).squeeze(1)
-        index = self._selecting.neighbours.index
-        lists = index.others_within(radius, rows=rows, max_neighbours=_MAX_NEIGHBOURS)
-        outside = ~subset.members[lists.indices.long()]
-        rim = rows[torch.unique(lists.queries[outside].long())].numpy()
-        smaller = values.copy()
-        smaller[rim] = 0
-        if not (smaller >= MEMBER).any():
-            raise InputError("shrink: nothing would be left of the selection.")
-        return self._reselect(smaller, "shrink", factor, author)
+        values = shaping.shrunk(self._selected(), self._selecting.neighbours, factor)
+        return self._reselect(values, "shrink", factor, author)
 
     def fill_holes(self, *, author: str = "") -> Document:
         """Add small gaps within the selection.
@@ -461,38 +444,21 @@ class Session:
         Raises:
             InputError: If nothing is selected.
         """
-        values = self._selected_values("fill holes")
-        members = Selection(mask=torch.from_numpy(values >= MEMBER))
-        found = holes(self._selecting.neighbours.graph, members).mask.numpy()
-        return self._reselect(np.where(found, 255, values), "fill_holes", None, author)
+        values = shaping.filled(self._selected(), self._selecting.neighbours)
+        return self._reselect(values, "fill_holes", None, author)
 
-    def _selected_values(self, what: str) -> Confidence:
+    def _selected(self) -> Confidence:
         if self.document.selection is None:
-            raise InputError(f"{what}: expected a selection, got none; select something first.")
+            raise InputError("selection: expected one, got none; select something first.")
         return self._masks.get(self.document.selection)
 
-    def _around(self, factor: float) -> tuple[Confidence, Subset, float]:
-        """The selection, and a distance of so many times that of its Gaussians."""
-        if not 0 < factor <= 100:
-            raise InputError(f"factor: expected more than 0 and at most 100, got {factor:g}.")
-        values = self._selected_values("grow or shrink")
-        index = self._selecting.neighbours.index
-        members = torch.from_numpy(values >= MEMBER)
-        subset = Subset(index, members)
-        radius = growth_radius(subset, 0.5)
-        if not radius > 0:
-            # One Gaussian, or several in one place: the distance to the next one of the scene.
-            rows = torch.nonzero(members).squeeze(1)
-            radius = float(index.nearest_others(1, rows=rows).distances.max())
-        return values, subset, factor * radius
-
     def _reselect(
-        self, values: NDArray[Any], what: str, factor: float | None, author: str
+        self, values: Confidence, what: str, factor: float | None, author: str
     ) -> Document:
         step: dict[str, Any] = {"kind": what} | ({} if factor is None else {"factor": factor})
         earlier = self.document.prompt or {}
         prompts = [*earlier.get("prompts", []), step][-_MAX_PROMPTS:]
-        mask = self._masks.put(values.astype(np.uint8))
+        mask = self._masks.put(values)
         return self.do(Select(mask, {**earlier, "prompts": prompts}), author=author)
 
     # Objects.
@@ -504,7 +470,7 @@ class Session:
             InputError: If there is no such layer, or it has no things.
         """
         found = self._selecting.layer(layer)
-        made = products.suggestions_of(found, self._masks, name=layer)
+        made = shaping.suggestions_of(found, self._masks, name=layer)
         return self.do(Suggest(made), author=author)
 
     def split(
@@ -531,9 +497,11 @@ class Session:
         """
         one = self.document.object(id)
         confidence = self._masks.get(one.mask)
-        part = self._parts(confidence, by, plane)
-        means = self._scene.gaussians.means.detach().cpu().double().numpy()
-        parts = products.parts_of(part, confidence, means, what=by)
+        gaussians = self._scene.gaussians
+        tree = self._selecting.tree() if by == "tree" else None
+        part = shaping.numbered_parts(confidence, gaussians, by, tree=tree, plane=plane)
+        means = gaussians.means.detach().cpu().double().numpy()
+        parts = shaping.parts_of(part, confidence, means, what=by)
         taken = {other.name for other in self.document.objects}
         names = [one.name]
         for _ in parts[1:]:
@@ -541,27 +509,6 @@ class Session:
             taken.add(names[-1])
         masks = tuple(self._masks.put(values) for values in parts)
         return self.do(Split(id, masks, tuple(names)), author=author, revision=revision)
-
-    def _parts(
-        self, confidence: Confidence, by: SplitBy, plane: Sequence[float] | None
-    ) -> NDArray[np.int64]:
-        """The part of each Gaussian, -1 where that is not known."""
-        gaussians = self._scene.gaussians
-        if (plane is not None) != (by == "plane"):
-            raise InputError("split: expected a plane with by plane, and with it alone.")
-        if by == "parts":
-            members = Selection(mask=torch.from_numpy(confidence >= MEMBER))
-            return components(gaussians, members).numpy()
-        if by == "tree":
-            found = self._selecting.tree()
-            if found is None or not isinstance(found[1], InstanceTree):
-                raise InputError("split: expected a scene with a tree, got one without.")
-            return found[1].cut("part").ids.cpu().long().numpy()
-        values = np.array(plane if plane is not None else (), dtype=np.float64)
-        if values.shape != (4,) or not np.isfinite(values).all() or not values[:3].any():
-            raise InputError(f"plane: expected four numbers a, b, c, d, got {quoted(plane)}.")
-        means = gaussians.means.detach().cpu().double().numpy()
-        return (means @ values[:3] + values[3] > 0).astype(np.int64)
 
     # What is taken away.
 
@@ -652,25 +599,6 @@ class Session:
             made = products.edited(self._scene.gaussians, edits, self._masks)
             self._edited = edits, made
         return self._edited[1]
-
-
-def combined(new: Confidence, base: Confidence | None, mode: Mode) -> Confidence:
-    """A selection added to, taken from or intersected with an earlier one, as fuzzy sets are.
-
-    Raises:
-        ShapeError: If they are of different scenes.
-    """
-    if base is None or mode == "set":
-        return new
-    if base.shape != new.shape:
-        raise ShapeError(f"base: expected {len(new)} confidences, got {len(base)}.")
-    match mode:
-        case "add":
-            return np.maximum(base, new)
-        case "remove":
-            return np.minimum(base, 255 - new)
-        case "intersect":
-            return np.minimum(base, new)
 
 
 def _joined_record(
