@@ -37,7 +37,8 @@ from splatseg.viewer._document import (
 )
 from splatseg.viewer._draw import Drawer, Pace
 from splatseg.viewer._mirror import Mirror, scene_info, view_infos
-from splatseg.viewer._session import Session, combined, open_session
+from splatseg.viewer._session import Session, open_session
+from splatseg.viewer._shaping import combined
 from splatseg.viewer._worker import Client, Job, Worker
 
 _MODES = ("colour", "objects", "blend", "confidence", "depth", "pca", "similarity")

@@ -21,7 +21,7 @@ from splatseg.io.atomic import path_inside
 from splatseg.render import BackendName
 from splatseg.viewer import _guard as guard
 from splatseg.viewer import _messages as messages
-from splatseg.viewer._worker import Client, Worker
+from splatseg.viewer._worker import Client, Worker, about, error_message
 
 STATIC = Path(__file__).parent / "static"
 """The page."""
@@ -219,7 +219,7 @@ class ViewServer:
             client = self.worker.join(page.post)
             if client is None:
                 text = f"{guard.MAX_CLIENTS} pages are open, which is the most"
-                await page.refuse(text, fix="close another one")
+                await page.say(messages.Error(text=text, fix="close another one"))
                 await websocket.close(_LATER)
                 return
             sending = asyncio.create_task(page.send_all(client))
@@ -311,15 +311,26 @@ class _Page:
             if len(text) > messages.MAX_LONG_TEXT:
                 await self._websocket.close(_TOO_BIG)
                 return
-            try:
-                message = messages.parse(text)
-                self._check_rate(message)
-                self._worker.give(client, message)
-            except InputError as error:
-                await self.refuse(str(error))
-                if not self._refused.allows():
-                    await self._websocket.close(_POLICY)
-                    return
+            refusal = self._refusal(client, text)
+            if refusal is None:
+                continue
+            await self.say(refusal)
+            if not self._refused.allows():
+                await self._websocket.close(_POLICY)
+                return
+
+    def _refusal(self, client: Client, text: str) -> messages.Error | None:
+        """Pass a message on; what is wrong with it otherwise."""
+        try:
+            message = messages.parse(text)
+        except InputError as error:
+            return error_message(error)
+        try:
+            self._check_rate(message)
+            self._worker.give(client, message)
+        except InputError as error:
+            return error_message(error, **about(message))
+        return None
 
     def _check_rate(self, message: messages.Incoming) -> None:
         match message:
@@ -334,9 +345,9 @@ class _Page:
         if not rate.allows():
             raise InputError(f"too many {what} in a second; wait a moment.")
 
-    async def refuse(self, text: str, *, fix: str = "") -> None:
-        """Say what is wrong with a message."""
-        await self._websocket.send_text(messages.form(messages.Error(text=text, fix=fix)))
+    async def say(self, error: messages.Error) -> None:
+        """Say what is wrong."""
+        await self._websocket.send_text(messages.form(error))
 
 
 def _listen(host: str, port: int) -> socket.socket:

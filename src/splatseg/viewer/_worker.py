@@ -450,12 +450,8 @@ class Worker:
         return draw
 
     def _do_task(self, client: Client, message: messages.Incoming) -> None:
-        about: dict[str, int | str | None] = {}
-        if isinstance(message, messages.SelectRequest | messages.DepthRequest):
-            about["gesture"] = message.gesture
-        elif isinstance(message, messages.CommandRequest):
-            about["command"] = message.name if message.name in messages.COMMANDS else None
-        self.attempt(lambda: self._of_answers().answer(client, message), client, **about)
+        work = self._of_answers().answer
+        self.attempt(lambda: work(client, message), client, **about(message))
 
     def _do_call(self, work: Callable[[Any], Any], future: "Future[Any]") -> None:
         if not future.set_running_or_notify_cancel():
@@ -490,6 +486,19 @@ def _at_rest(request: messages.DrawRequest) -> messages.DrawRequest:
     import msgspec
 
     return msgspec.structs.replace(request, rest=True)
+
+
+def about(message: messages.Incoming) -> dict[str, int | str | None]:
+    """The gesture, job or command that an error of a message is about."""
+    match message:
+        case messages.SelectRequest() | messages.DepthRequest():
+            return {"gesture": message.gesture}
+        case messages.JobRequest():
+            return {"id": message.id}
+        case messages.CommandRequest():
+            return {"command": message.name if message.name in messages.COMMANDS else None}
+        case _:
+            return {}
 
 
 def error_message(error: BaseException, **about: Any) -> messages.Error:
