@@ -71,3 +71,17 @@ def client(server) -> Iterator[httpx.Client]:
     """A browser that has logged in."""
     with logged_in(server) as found:
         yield found
+
+
+@pytest.fixture
+def run(capsys) -> Callable[..., tuple[int, str, str]]:
+    """Run a command as the shell does: (status, stdout, stderr)."""
+    from splatseg.cli import main
+
+    def invoke(*words: object) -> tuple[int, str, str]:
+        capsys.readouterr()
+        status = main([str(word) for word in words])
+        captured = capsys.readouterr()
+        return status, captured.out, captured.err
+
+    return invoke

@@ -309,8 +309,9 @@ def test_no_path_leads_out_of_its_folder(server, things, static, path: str) -> N
     exports = things / "exports"
     (exports / "folder").mkdir(parents=True, exist_ok=True)
     (exports / ".hidden").write_text("secret")
-    (exports / "link.ply").symlink_to(things / "scene.json")
-    (static / "link.js").symlink_to(things / "scene.json")
+    for link in (exports / "link.ply", static / "link.js"):
+        link.unlink(missing_ok=True)
+        link.symlink_to(things / "scene.json")
     assert raw(server, path, **cookie(server)) in (400, 404)
 
 

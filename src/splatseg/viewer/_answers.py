@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import msgspec
@@ -40,6 +40,8 @@ from splatseg.viewer._mirror import Mirror, scene_info, view_infos
 from splatseg.viewer._session import Session, open_session
 from splatseg.viewer._shaping import combined
 from splatseg.viewer._worker import Client, Job, Worker
+
+T = TypeVar("T")
 
 _MODES = ("colour", "objects", "blend", "confidence", "depth", "pca", "similarity")
 _MOVING_QUALITY, _REST_QUALITY = 75, 92
@@ -133,8 +135,8 @@ class SceneAnswers:
             scene=self._scene_info,
             views=self._views,
             layers=list(scene.layers),
-            source=session.source,
-            words=session.words,
+            source=_or(None, lambda: session.source),
+            words=_or(False, lambda: session.words),  # noqa: FBT003
             modes=list(_MODES),
             features=list(messages.FEATURES),
             document=self._mirror.document(session.document),
@@ -615,6 +617,14 @@ class _Look:
                     ids[member & (owners < 0)] = _FIRST_SUGGESTION + one.id
             self._ids = ids
         return self._ids
+
+
+def _or(otherwise: T, question: Callable[[], T]) -> T:
+    """What a layer that cannot be read is asked in vain; clicks will say what is wrong."""
+    try:
+        return question()
+    except InputError:
+        return otherwise
 
 
 def _memory(client: Client) -> _Memory:

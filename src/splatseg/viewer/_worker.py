@@ -312,8 +312,11 @@ class Worker:
         self.broadcast(messages.Clients(n=count))
 
     def _welcome(self, answers: Answers, client: Client) -> None:
-        answers.join(client)
-        client.welcomed = True
+        def join() -> None:
+            answers.join(client)
+            client.welcomed = True
+
+        self.attempt(join, client)
 
     # In the thread.
 
