@@ -6,9 +6,10 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,9 @@ from splatseg.fit._checkpoint import FitState, write_checkpoint
 from splatseg.io.scene import load_scene
 from splatseg.io.scene_folder import CHECKPOINT_FILE
 from splatseg.io.splats import write_splats
-from support.viewer import EACH, RED_PIXEL, WIDTH, Page
+from splatseg.viewer import _fitting
+from splatseg.viewer._server import ViewServer
+from support.viewer import EACH, RED_PIXEL, WIDTH, Page, opened
 
 
 @contextmanager
@@ -62,6 +65,16 @@ def entered(facts: dict[str, Any]) -> Page:
     return page
 
 
+def meanwhile(monkeypatch: pytest.MonkeyPatch, look: Callable[[Page], None]) -> None:
+    """Let a page do something instead of waiting for Ctrl-C, in this process."""
+
+    def wait(server: ViewServer) -> None:
+        with opened(server) as page:
+            look(page)
+
+    monkeypatch.setattr(ViewServer, "wait", wait)
+
+
 def ended(process: "subprocess.Popen[str]", number: int = signal.SIGINT) -> tuple[int, str]:
     """The status and the errors of a process that a signal ends."""
     process.send_signal(number)
@@ -78,15 +91,9 @@ def test_a_scene_is_served_until_ctrl_c_and_kept(things) -> None:
             page.command("keep", name="mug")
             # With a page open, too.
             assert ended(process) == (0, "")
-    with running(things, "--layer", "things") as (facts, process):
-        with entered(facts) as page:
-            document = page.heard[0]["document"]
-            assert [one["name"] for one in document["objects"]] == ["mug"]
-            assert len(document["suggestions"]) == 3
-        assert ended(process, signal.SIGTERM) == (0, "")
 
 
-def test_what_was_made_outlives_a_killed_process(things) -> None:
+def test_what_was_made_outlives_a_killed_process(things, run, monkeypatch) -> None:
     with running(things) as (facts, process), entered(facts) as page:
         page.select(1, points=[RED_PIXEL])
         page.command("keep", name="mug")
@@ -112,31 +119,38 @@ def file(things, tmp_path) -> Path:
     return path
 
 
-def test_a_splat_file_is_imported_into_a_new_scene(file, tmp_path) -> None:
+def test_a_splat_file_is_imported_into_a_new_scene(file, tmp_path, run, monkeypatch) -> None:
     folder = tmp_path / "new"
-    with running(file, "--output", folder, "--quiet") as (facts, process):
-        with entered(facts) as page:
-            state = page.heard[0]
-            assert state["scene"]["count"] == 3 * EACH
-            assert state["views"]
-            assert not any(view["photograph"] for view in state["views"])
-            assert page.still(1).size[0] == WIDTH
-            assert page.select(1, points=[[48, 36]], camera=None, view=state["views"][0]["name"])
-        assert ended(process)[0] == 0
+
+    def look(page: Page) -> None:
+        state = page.heard[0]
+        assert state["scene"]["count"] == 3 * EACH
+        assert state["views"]
+        assert not any(view["photograph"] for view in state["views"])
+        assert page.still(1).size[0] == WIDTH
+        name = state["views"][0]["name"]
+        assert page.select(1, "box", box=[0, 0, 800, 600], camera=None, view=name)["count"]
+
+    meanwhile(monkeypatch, look)
+    assert run("view", file, "--output", folder, "--no-open", "--quiet")[0] == 0
     assert len(load_scene(folder).gaussians) == 3 * EACH
     assert (folder / "view" / "journal.jsonl").is_file()
 
 
-def test_without_a_folder_the_scene_is_temporary(file, tmp_path, monkeypatch) -> None:
-    monkeypatch.setenv("TMPDIR", str(tmp_path))
-    with running(file) as (facts, process):
-        (folder,) = tmp_path.glob("splatseg-view-*")
-        with entered(facts) as page:
-            assert page.heard[0]["scene"]["name"] == "things"
-        status, errors = ended(process)
+def test_without_a_folder_the_scene_is_temporary(file, tmp_path, run, monkeypatch) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    folders: list[Path] = []
+
+    def look(page: Page) -> None:
+        folders.extend(tmp_path.glob("splatseg-view-*"))
+        assert page.heard[0]["scene"]["name"] == "things"
+
+    meanwhile(monkeypatch, look)
+    status, _, errors = run("view", file, "--no-open")
     assert status == 0
     assert "--output keeps it" in errors
-    assert not folder.exists()
+    assert len(folders) == 1
+    assert not folders[0].exists()
 
 
 def checkpoint(folder: Path, gaussians: Gaussians, steps: int) -> None:
@@ -163,27 +177,34 @@ def test_gaussians_of_a_checkpoint_are_those_of_the_fit(things, tmp_path) -> Non
         torch.testing.assert_close(getattr(found, name), getattr(wanted, name))
 
 
-def test_a_fit_is_shown_as_its_checkpoints_come(things, tmp_path) -> None:
+def test_a_fit_is_shown_as_its_checkpoints_come(things, tmp_path, run, monkeypatch) -> None:
+    monkeypatch.setattr(_fitting, "_SECONDS", 0.05)
     gaussians = load_scene(things).gaussians
     folder = tmp_path / "fit-of-things"
     checkpoint(folder, gaussians[:EACH], 10)
-    with running(folder) as (facts, process):
-        with entered(facts) as page:
-            state = page.heard[0]
-            assert state["scene"]["count"] == EACH
-            assert state["fitting"] == {"steps": 10, "progress": 0.1}
-            page.still(1)
-            checkpoint(folder, gaussians, 50)
-            state = page.next("state")
-            assert state["scene"]["count"] == 3 * EACH
-            assert state["fitting"]["steps"] == 50
-            assert page.frame(1).rest
-            shutil.copytree(things, folder, dirs_exist_ok=True)
-            state = page.next("state")
-            assert state["fitting"] is None
-            assert state["views"]
-            page.select(1, points=[RED_PIXEL])
-        assert ended(process) == (0, "")
+
+    def look(page: Page) -> None:
+        state = page.heard[0]
+        assert state["scene"]["count"] == EACH
+        assert state["fitting"] == {"steps": 10, "progress": 0.1}
+        page.still(1)
+        checkpoint(folder, gaussians, 50)
+        state = page.next("state")
+        assert state["scene"]["count"] == 3 * EACH
+        assert state["fitting"]["steps"] == 50
+        assert page.frame(1).rest
+        # scene.json comes last, as in a fit.
+        shutil.copytree(
+            things, folder, dirs_exist_ok=True, ignore=shutil.ignore_patterns("scene.json")
+        )
+        shutil.copy(things / "scene.json", folder)
+        state = page.next("state")
+        assert state["fitting"] is None
+        assert state["views"]
+        page.select(1, points=[RED_PIXEL])
+
+    meanwhile(monkeypatch, look)
+    assert run("view", folder, "--no-open")[0] == 0
     assert (folder / "view" / "journal.jsonl").is_file()
 
 
@@ -219,28 +240,24 @@ def test_a_fit_without_a_checkpoint_is_said(run, tmp_path) -> None:
 def test_the_browser_is_opened_where_there_is_a_screen(things, run, monkeypatch) -> None:
     import webbrowser
 
-    from splatseg.viewer._server import ViewServer
-
-    opened: list[str] = []
-    monkeypatch.setattr(webbrowser, "open", opened.append)
+    shown: list[str] = []
+    monkeypatch.setattr(webbrowser, "open", shown.append)
     monkeypatch.setattr(ViewServer, "wait", lambda self: None)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     monkeypatch.setattr(sys, "platform", "linux")
     monkeypatch.delenv("DISPLAY", raising=False)
     assert run("view", things)[0] == 0
-    assert opened == []
+    assert shown == []
     monkeypatch.setenv("DISPLAY", ":0")
     status, text, _ = run("view", things)
     assert status == 0
-    assert len(opened) == 1
+    assert len(shown) == 1
     assert opened[0] in text
     assert run("view", things, "--no-open")[0] == 0
-    assert len(opened) == 1
+    assert len(shown) == 1
 
 
 def test_other_machines_are_let_in_with_a_warning(things, run, monkeypatch) -> None:
-    from splatseg.viewer._server import ViewServer
-
     monkeypatch.setattr(ViewServer, "wait", lambda self: None)
     status, text, notes = run("view", things, "--no-open", "--host", "0.0.0.0")
     assert status == 0

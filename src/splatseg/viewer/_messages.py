@@ -292,7 +292,7 @@ class Split(OfId, kw_only=True):
 
     by: Literal["parts", "tree", "plane"] = "parts"
     plane: tuple[World, World, World, World] | None = None
-    """a x + b y + c z = d, with "plane"."""
+    """a, b, c, d of a x + b y + c z + d = 0, with "plane"."""
 
 
 class SelectObject(_Incoming, kw_only=True):
