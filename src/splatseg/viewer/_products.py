@@ -18,7 +18,6 @@ from splatseg.core import (
     Gaussians,
     InstanceFacts,
     Labels,
-    Layer,
     LayerInfo,
     Scene,
     Selection,
@@ -28,7 +27,9 @@ from splatseg.core.rigid import rotation_from_quaternion
 from splatseg.edit import duplicate, recolour, remove, transform
 from splatseg.errors import InputError
 from splatseg.io.atomic import named_write_failures, path_inside
+from splatseg.io.export.splats import holds_columns
 from splatseg.io.scene import check_name
+from splatseg.io.splats import WritableFormat
 from splatseg.render import BackendName
 from splatseg.tasks import ExportOptions, export_scene
 from splatseg.tasks.work import EXPORTS_FOLDER, Observer, layer_versions
@@ -213,6 +214,7 @@ def export(
     *,
     what: ExportWhat,
     name: str,
+    format: WritableFormat | None,
     only: Sequence[int] | None,
     backend: BackendName,
     observer: Observer,
@@ -224,24 +226,29 @@ def export(
         labels: Its objects; None where there are none.
         folder: Where to write to.
         what: See `splatseg.export_scene`.
-        name: Of the file; its ending says the format. Without one it is PLY, or CSV of a table.
+        name: Of the file; its ending says the format.
+        format: Of splats, where the name does not say it.
         only: Ids of objects that are written alone; None writes everything.
         backend: Rendering backend.
         observer: Is told of the progress.
+
+    Raises:
+        InputError: If the name is none, or there is nothing to write.
     """
     check_name("export", name)
-    file = name if "." in name else f"{name}{_SUFFIXES.get(what, '')}"
-    options = ExportOptions(
-        layer=None if labels is None else _LAYER,
-        only=() if only is None else tuple(str(id) for id in only),
-    )
-    layers: dict[str, Layer] = {} if labels is None else {_LAYER: labels}
+    ending = f".{format.rstrip('3')}" if format is not None and what == "splat" else None
+    path = folder / (name if "." in name else name + (ending or _SUFFIXES.get(what, "")))
+    if labels is not None and only is not None and what in ("splat", "points"):
+        rows = torch.isin(labels.ids, torch.tensor(only, dtype=labels.ids.dtype))
+        scene, labels = replace(scene, gaussians=scene.gaussians[rows]), labels[rows]
+    if what == "splat" and not holds_columns(path, format):
+        labels = None
     made = export_scene(
         scene,
-        folder / file,
+        path,
         what,
-        options=options,
-        layers=layers,
+        options=ExportOptions(layer=None if labels is None else _LAYER, splat_format=format),
+        layers={} if labels is None else {_LAYER: labels},
         backend=backend,
         observer=observer,
     )

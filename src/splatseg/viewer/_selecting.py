@@ -27,7 +27,7 @@ from splatseg.core import (
 from splatseg.errors import InputError
 from splatseg.prompting.next_click import next_click
 from splatseg.prompting.pipeline import SceneIndex
-from splatseg.prompting.prompts import Lasso, SelectionPrompt, ViewPrompt
+from splatseg.prompting.prompts import AxisBox, Ball, Lasso, SelectionPrompt, ViewPrompt
 from splatseg.prompting.seen import SeenPrompt
 from splatseg.render import BackendName
 from splatseg.selection import pieces
@@ -248,8 +248,8 @@ class Selecting:
 
         made = selector.select(prompts, options=options, advise=False, draft=tell)
         self.seconds = dict(made.seconds)
-        places = not any(isinstance(prompt, ViewPrompt) for prompt in prompts)
-        source = "" if places and not made.source else (self.source or COLOUR)
+        places = all(isinstance(prompt, AxisBox | Ball | Lasso) for prompt in prompts)
+        source = "" if places else (self.source or COLOUR)
         return made.selection, {"source": source, "prompts": self._records(prompts, level)}
 
     def find_words(self, words: str) -> tuple[Selection, dict[str, Any]]:

@@ -29,7 +29,7 @@ from splatseg.core import (
 from splatseg.errors import InputError, quoted
 from splatseg.io.scene import load_scene, save_scene_layer, scene_layer_names
 from splatseg.io.scene_folder import scene_path
-from splatseg.io.splats import read_splats
+from splatseg.io.splats import WritableFormat, read_splats
 from splatseg.prompting.prompts import AxisBox, Ball, Lasso, SelectionPrompt, Similar, ViewPrompt
 from splatseg.render import BackendName
 from splatseg.tasks.work import SILENT, Observer
@@ -435,7 +435,8 @@ class Session:
         Raises:
             InputError: If nothing is selected, or nothing would be left.
         """
-        values = shaping.shrunk(self._selected(), self._selecting.neighbours, factor)
+        neighbours = self._selecting.neighbours
+        values = shaping.shrunk(self._selected(), self._scene.gaussians, neighbours, factor)
         return self._reselect(values, "shrink", factor, author)
 
     def fill_holes(self, *, author: str = "") -> Document:
@@ -552,14 +553,21 @@ class Session:
         return labels
 
     def export(
-        self, what: products.ExportWhat, name: str, ids: Iterable[int] | None = None
+        self,
+        what: products.ExportWhat,
+        name: str,
+        ids: Iterable[int] | None = None,
+        *,
+        format: WritableFormat | None = None,
     ) -> Path:
         """Write the scene with its edits, or objects of it, into its folder ``exports``.
 
         Args:
             what: splat, objects (a file each), points, coco or table.
-            name: Of the file or folder; its ending says the format, PLY without one.
+            name: Of the file or folder; its ending says the format.
             ids: Only these objects; None takes everything.
+            format: Of splats, where the name does not say it; None is PLY. Other formats hold no
+                labels.
 
         Returns:
             What was written.
@@ -580,6 +588,7 @@ class Session:
             products.exports_folder(self._scene, self._folder),
             what=what,
             name=name,
+            format=format,
             only=only,
             backend=self._backend,
             observer=self._observer,
