@@ -35,6 +35,7 @@ from splatseg.tasks.query import QuerySession
 from splatseg.tasks.select import SelectionSession, open_selector, prompt_record
 from splatseg.tasks.sources import QueryOptions, SelectOptions
 from splatseg.tasks.work import Observer, Work
+from splatseg.viewer._shaping import Mode
 from splatseg.viewer._state import MEMBER, Confidence
 
 COLOUR = "colour"
@@ -53,6 +54,9 @@ _POINTED_AT = 0.1
 
 _MAX_SEEDS = 16
 """Most Gaussians that were pointed at whose colours others are compared with."""
+
+_MAX_PROMPTS = 64
+"""Most prompts of a selection that are recorded, the last."""
 
 _IN, _OUT = 0.501, 0.499
 
@@ -344,6 +348,23 @@ class Selecting:
                 observer=self._observer,
             )
         return self._words
+
+
+def joined_record(
+    record: dict[str, Any], earlier: dict[str, Any] | None, mode: Mode
+) -> dict[str, Any]:
+    """The record of prompts behind those that they were combined with."""
+    how = {} if mode == "set" else {"mode": mode}
+    joined = recorded_after(earlier, [{**prompt, **how} for prompt in record["prompts"]])
+    return joined | {"source": record["source"] or joined.get("source", "")}
+
+
+def recorded_after(
+    earlier: dict[str, Any] | None, prompts: Sequence[dict[str, Any]]
+) -> dict[str, Any]:
+    """An earlier record with further prompts; of very many the last."""
+    before = earlier or {}
+    return {**before, "prompts": [*before.get("prompts", []), *prompts][-_MAX_PROMPTS:]}
 
 
 def front_view(gaussians: Gaussians, *, width: int = 320, height: int = 240) -> View:

@@ -35,34 +35,32 @@ from splatseg.render import BackendName
 from splatseg.tasks.work import SILENT, Observer
 from splatseg.viewer import _products as products
 from splatseg.viewer import _shaping as shaping
+from splatseg.viewer._editor import Callback, Editor
 from splatseg.viewer._journal import Journal
 from splatseg.viewer._masks import MaskStore
-from splatseg.viewer._selecting import Selecting, bytes_of, selection_of
+from splatseg.viewer._selecting import (
+    Selecting,
+    bytes_of,
+    joined_record,
+    recorded_after,
+    selection_of,
+)
 from splatseg.viewer._shaping import Mode, SplitBy
 from splatseg.viewer._state import (
     MEMBER,
     Command,
     Confidence,
     Document,
-    Entry,
     History,
-    Key,
     Mask,
     Select,
     Split,
     Suggest,
-    changed_keys,
     free_name,
-    keys_of,
 )
 
 VIEW_FOLDER = "view"
 """Folder of a scene that holds the journal."""
-
-Callback = Callable[[Document, Document, str], None]
-
-_MAX_PROMPTS = 64
-"""Most prompts of a selection that are recorded, the last."""
 
 
 def open_session(
@@ -123,15 +121,11 @@ class Session:
         observer: Observer = SILENT,
     ) -> None:
         self._scene = scene
-        self._journal = journal
         self._folder = folder
         self._backend: BackendName = backend
         self._observer = observer
-        self._masks = MaskStore(len(scene.gaussians)) if journal is None else journal.masks
-        self._history = History() if journal is None else journal.history
-        self._opened_at = self.revision
-        self._changes: dict[Key, dict[str, int]] = {}
-        self._callbacks: list[Callback] = []
+        self._editor = Editor(len(scene.gaussians), journal)
+        self._masks, self._history = self._editor.masks, self._editor.history
         self._selecting = Selecting(scene, backend=backend, observer=observer)
         self._owners = products.Owners(len(scene.gaussians), self._masks)
         self._edited: tuple[tuple[object, ...], Edited] | None = None
@@ -145,8 +139,7 @@ class Session:
     def close(self) -> None:
         """Release what it holds, and the lock of the journal."""
         self._selecting.close()
-        if self._journal is not None:
-            self._journal.close()
+        self._editor.close()
 
     @property
     def scene(self) -> Scene:
@@ -191,7 +184,7 @@ class Session:
     @property
     def notes(self) -> tuple[str, ...]:
         """What should be known of how the journal was opened."""
-        return () if self._journal is None else self._journal.notes
+        return self._editor.notes
 
     @property
     def source(self) -> str | None:
@@ -252,13 +245,7 @@ class Session:
         Returns:
             A function that ends it.
         """
-        self._callbacks.append(callback)
-
-        def end() -> None:
-            if callback in self._callbacks:
-                self._callbacks.remove(callback)
-
-        return end
+        return self._editor.subscribe(callback)
 
     # Commands.
 
@@ -275,10 +262,7 @@ class Session:
             InputError: If it cannot be done; a sentence says why.
             OutputError: If it cannot be written down; nothing was done.
         """
-        if revision is not None:
-            self._check_unchanged(command, author, revision)
-        entry = self._history.checked(command, self._masks, author)
-        return self._written(entry.after, author, lambda: self._history.do(entry), entry=entry)
+        return self._editor.do(command, author=author, revision=revision)
 
     def undo(self, author: str = "") -> Document:
         """Take the last command back, whoever did it.
@@ -286,9 +270,7 @@ class Session:
         Raises:
             InputError: If there is nothing to undo.
         """
-        self._history.check_undo()
-        before = self._history.entries[-1].before
-        return self._written(before, author, self._history.undo)
+        return self._editor.undo(author)
 
     def redo(self, author: str = "") -> Document:
         """Do again what was undone last.
@@ -296,42 +278,7 @@ class Session:
         Raises:
             InputError: If there is nothing to redo.
         """
-        self._history.check_redo()
-        return self._written(self._history.next_redo.after, author, self._history.redo, redo=True)
-
-    def _written(
-        self,
-        after: Document,
-        author: str,
-        change: Callable[[], Document],
-        *,
-        entry: Entry | None = None,
-        redo: bool = False,
-    ) -> Document:
-        """Write a change down, make it, and tell of it."""
-        before = self.document
-        after = self._history.numbered(after)
-        if self._journal is not None:
-            command = None if entry is None else entry.command
-            self._journal.write(command, author=author, after=after, redo=redo)
-        change()
-        for key in changed_keys(before, after):
-            self._changes.setdefault(key, {})[author] = after.revision
-        for callback in tuple(self._callbacks):
-            callback(before, self.document, author)
-        return self.document
-
-    def _check_unchanged(self, command: Command, author: str, revision: int) -> None:
-        for key in keys_of(command):
-            changes = self._changes.get(key, {})
-            others = (at for who, at in changes.items() if not who or who != author)
-            last = max(others, default=self._opened_at)
-            if max(last, self._opened_at) > revision:
-                kind, id = key
-                name = "" if kind == "selection" else f" {id}"
-                raise InputError(
-                    f"{kind}{name}: it was changed since you saw it; look at it and try again."
-                )
+        return self._editor.redo(author)
 
     # Selecting.
 
@@ -390,7 +337,7 @@ class Session:
             given = (prompts,) if one else tuple(prompts)
             made, record = self._selecting.select(given, level=level, draft=tell)
         earlier = self.document.prompt if under == self.document.selection else None
-        record = _joined_record(record, None if below is None else earlier, mode)
+        record = joined_record(record, None if below is None else earlier, mode)
         mask = self._masks.put(shaping.combined(bytes_of(made), below, mode))
         return self.do(Select(mask if mask.count else None, record), author=author)
 
@@ -457,10 +404,8 @@ class Session:
         self, values: Confidence, what: str, factor: float | None, author: str
     ) -> Document:
         step: dict[str, Any] = {"kind": what} | ({} if factor is None else {"factor": factor})
-        earlier = self.document.prompt or {}
-        prompts = [*earlier.get("prompts", []), step][-_MAX_PROMPTS:]
-        mask = self._masks.put(values)
-        return self.do(Select(mask, {**earlier, "prompts": prompts}), author=author)
+        record = recorded_after(self.document.prompt, [step])
+        return self.do(Select(self._masks.put(values), record), author=author)
 
     # Objects.
 
@@ -608,18 +553,6 @@ class Session:
             made = products.edited(self._scene.gaussians, edits, self._masks)
             self._edited = edits, made
         return self._edited[1]
-
-
-def _joined_record(
-    record: dict[str, Any], earlier: dict[str, Any] | None, mode: Mode
-) -> dict[str, Any]:
-    """The record of prompts behind those that they were combined with."""
-    prompts = [
-        dict(prompt) if mode == "set" else {**prompt, "mode": mode} for prompt in record["prompts"]
-    ]
-    before = (earlier or {}).get("prompts", [])
-    source = record["source"] or (earlier or {}).get("source", "")
-    return {"source": source, "prompts": [*before, *prompts][-_MAX_PROMPTS:]}
 
 
 def _digest_of(scene: Scene) -> str:
