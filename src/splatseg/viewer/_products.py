@@ -3,6 +3,7 @@
 Edits become those of `splatseg.edit`, in their order; labels follow them row by row.
 """
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -25,10 +26,10 @@ from splatseg.core import (
 )
 from splatseg.core.rigid import rotation_from_quaternion
 from splatseg.edit import duplicate, recolour, remove, transform
-from splatseg.errors import InputError
+from splatseg.errors import InputError, quoted
 from splatseg.io.atomic import named_write_failures, path_inside
 from splatseg.io.export.splats import holds_columns
-from splatseg.io.scene import check_name
+from splatseg.io.scene import check_name, load_scene_layer, save_scene_layer, scene_layer_names
 from splatseg.io.splats import WritableFormat
 from splatseg.render import BackendName
 from splatseg.tasks import ExportOptions, export_scene
@@ -135,6 +136,41 @@ def labels_of(
             },
         ),
     )
+
+
+def save(labels: Labels, root: Path, name: str) -> None:
+    """Save labels as a layer of a scene folder.
+
+    Raises:
+        InputError: If a layer of this name is there that was not saved here.
+    """
+    if name in scene_layer_names(root) and load_scene_layer(root, name).info.method != METHOD:
+        raise InputError(
+            f"layer: {quoted(name)} is there already and was not saved here; choose another name."
+        )
+    save_scene_layer(labels, root, name)
+
+
+def shown(document: Document, owners: Owners, masks: Masks) -> NDArray[np.bool_]:
+    """(n,) which Gaussians of the scene are shown.
+
+    Not those that were removed, nor those of hidden objects; where objects are isolated, theirs
+    alone.
+    """
+    ids, _ = owners.of(document.objects)
+    found = ~np.isin(ids, [one.id for one in document.objects if not one.visible])
+    if document.isolated:
+        found &= np.isin(ids, document.isolated)
+    for edit in document.edits:
+        if edit.kind == "remove":
+            found &= masks.get(edit.mask) < MEMBER
+    return found
+
+
+def digest_of(scene: Scene) -> str:
+    """Tells the Gaussians of a scene from those of others: a digest of their centres."""
+    means = scene.gaussians.means.detach().cpu().float().contiguous().numpy()
+    return hashlib.blake2b(means.astype("<f4").tobytes(), digest_size=16).hexdigest()
 
 
 def _class_ids(document: Document, scene: Scene) -> dict[str, int]:

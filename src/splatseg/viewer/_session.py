@@ -8,7 +8,6 @@
 What is done is in the journal when the method returns. A session is for one thread.
 """
 
-import hashlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import EllipsisType
@@ -26,8 +25,8 @@ from splatseg.core import (
     Selection,
     apply_rows,
 )
-from splatseg.errors import InputError, quoted
-from splatseg.io.scene import load_scene, save_scene_layer, scene_layer_names
+from splatseg.errors import InputError
+from splatseg.io.scene import load_scene
 from splatseg.io.scene_folder import scene_path
 from splatseg.io.splats import WritableFormat, read_splats
 from splatseg.prompting.prompts import AxisBox, Ball, Lasso, SelectionPrompt, Similar, ViewPrompt
@@ -47,7 +46,6 @@ from splatseg.viewer._selecting import (
 )
 from splatseg.viewer._shaping import Mode, SplitBy
 from splatseg.viewer._state import (
-    MEMBER,
     Command,
     Confidence,
     Document,
@@ -92,7 +90,7 @@ def open_session(
     journal = None
     if place is not None:
         count = len(scene.gaussians)
-        journal = Journal(place, gaussians=count, digest=_digest_of(scene))
+        journal = Journal(place, gaussians=count, digest=products.digest_of(scene))
         for note in journal.notes:
             observer.note(note)
     return Session(scene, journal=journal, folder=place, backend=backend, observer=observer)
@@ -217,16 +215,7 @@ class Session:
         Not those that were removed, nor those of hidden objects; where objects are isolated,
         theirs alone.
         """
-        document = self.document
-        ids, _ = self._owners.of(document.objects)
-        hidden = [one.id for one in document.objects if not one.visible]
-        shown = ~np.isin(ids, hidden)
-        if document.isolated:
-            shown &= np.isin(ids, document.isolated)
-        for edit in document.edits:
-            if edit.kind == "remove":
-                shown &= self._masks.get(edit.mask) < MEMBER
-        return shown
+        return products.shown(self.document, self._owners, self._masks)
 
     def owners(self) -> NDArray[np.int32]:
         """(n,) the id of the object that each Gaussian belongs to, -1 for none.
@@ -484,17 +473,8 @@ class Session:
             OutputError: If it cannot be written.
         """
         labels = self.labels()
-        root = self._scene.root
-        if root is None:
-            return labels
-        if name in scene_layer_names(root) and self._scene.layers[name].info.method != (
-            products.METHOD
-        ):
-            raise InputError(
-                f"layer: {quoted(name)} is there already and was not saved here; choose another "
-                "name."
-            )
-        save_scene_layer(labels, root, name)
+        if self._scene.root is not None:
+            products.save(labels, self._scene.root, name)
         return labels
 
     def export(
@@ -553,9 +533,3 @@ class Session:
             made = products.edited(self._scene.gaussians, edits, self._masks)
             self._edited = edits, made
         return self._edited[1]
-
-
-def _digest_of(scene: Scene) -> str:
-    """Tells the Gaussians of a scene from those of others: a digest of their centres."""
-    means = scene.gaussians.means.detach().cpu().float().contiguous().numpy()
-    return hashlib.blake2b(means.astype("<f4").tobytes(), digest_size=16).hexdigest()
