@@ -32,8 +32,7 @@ class Written:
         self.history.do(entry)
 
     def undo(self) -> None:
-        self.history.check_undo()
-        after = self.history.numbered(self.history.entries[-1].before)
+        after = self.history.numbered(self.history.next_undo.before)
         self.journal.write(None, author="", after=after)
         self.history.undo()
 

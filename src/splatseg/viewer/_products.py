@@ -3,6 +3,7 @@
 Edits become those of `splatseg.edit`, in their order; labels follow them row by row.
 """
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +19,6 @@ from splatseg.core import (
     Gaussians,
     InstanceFacts,
     Labels,
-    Layer,
     LayerInfo,
     Scene,
     Selection,
@@ -26,9 +26,11 @@ from splatseg.core import (
 )
 from splatseg.core.rigid import rotation_from_quaternion
 from splatseg.edit import duplicate, recolour, remove, transform
-from splatseg.errors import InputError
+from splatseg.errors import InputError, quoted
 from splatseg.io.atomic import named_write_failures, path_inside
-from splatseg.io.scene import check_name
+from splatseg.io.export.splats import holds_columns
+from splatseg.io.scene import check_name, load_scene_layer, save_scene_layer, scene_layer_names
+from splatseg.io.splats import WritableFormat
 from splatseg.render import BackendName
 from splatseg.tasks import ExportOptions, export_scene
 from splatseg.tasks.work import EXPORTS_FOLDER, Observer, layer_versions
@@ -136,6 +138,41 @@ def labels_of(
     )
 
 
+def save(labels: Labels, root: Path, name: str) -> None:
+    """Save labels as a layer of a scene folder.
+
+    Raises:
+        InputError: If a layer of this name is there that was not saved here.
+    """
+    if name in scene_layer_names(root) and load_scene_layer(root, name).info.method != METHOD:
+        raise InputError(
+            f"layer: {quoted(name)} is there already and was not saved here; choose another name."
+        )
+    save_scene_layer(labels, root, name)
+
+
+def shown(document: Document, owners: Owners, masks: Masks) -> NDArray[np.bool_]:
+    """(n,) which Gaussians of the scene are shown.
+
+    Not those that were removed, nor those of hidden objects; where objects are isolated, theirs
+    alone.
+    """
+    ids, _ = owners.of(document.objects)
+    found = ~np.isin(ids, [one.id for one in document.objects if not one.visible])
+    if document.isolated:
+        found &= np.isin(ids, document.isolated)
+    for edit in document.edits:
+        if edit.kind == "remove":
+            found &= masks.get(edit.mask) < MEMBER
+    return found
+
+
+def digest_of(scene: Scene) -> str:
+    """Tells the Gaussians of a scene from those of others: a digest of their centres."""
+    means = scene.gaussians.means.detach().cpu().float().contiguous().numpy()
+    return hashlib.blake2b(means.astype("<f4").tobytes(), digest_size=16).hexdigest()
+
+
 def _class_ids(document: Document, scene: Scene) -> dict[str, int]:
     """Ids of the classes in use: the scene's, and behind them those that it has not."""
     rows = () if scene.classes is None else scene.classes.rows
@@ -213,6 +250,7 @@ def export(
     *,
     what: ExportWhat,
     name: str,
+    format: WritableFormat | None,
     only: Sequence[int] | None,
     backend: BackendName,
     observer: Observer,
@@ -224,24 +262,29 @@ def export(
         labels: Its objects; None where there are none.
         folder: Where to write to.
         what: See `splatseg.export_scene`.
-        name: Of the file; its ending says the format. Without one it is PLY, or CSV of a table.
+        name: Of the file; its ending says the format.
+        format: Of splats, where the name does not say it.
         only: Ids of objects that are written alone; None writes everything.
         backend: Rendering backend.
         observer: Is told of the progress.
+
+    Raises:
+        InputError: If the name is none, or there is nothing to write.
     """
     check_name("export", name)
-    file = name if "." in name else f"{name}{_SUFFIXES.get(what, '')}"
-    options = ExportOptions(
-        layer=None if labels is None else _LAYER,
-        only=() if only is None else tuple(str(id) for id in only),
-    )
-    layers: dict[str, Layer] = {} if labels is None else {_LAYER: labels}
+    ending = f".{format.rstrip('3')}" if format is not None and what == "splat" else None
+    path = folder / (name if "." in name else name + (ending or _SUFFIXES.get(what, "")))
+    if labels is not None and only is not None and what in ("splat", "points"):
+        rows = torch.isin(labels.ids, torch.tensor(only, dtype=labels.ids.dtype))
+        scene, labels = replace(scene, gaussians=scene.gaussians[rows]), labels[rows]
+    if what == "splat" and not holds_columns(path, format):
+        labels = None
     made = export_scene(
         scene,
-        folder / file,
+        path,
         what,
-        options=options,
-        layers=layers,
+        options=ExportOptions(layer=None if labels is None else _LAYER, splat_format=format),
+        layers={} if labels is None else {_LAYER: labels},
         backend=backend,
         observer=observer,
     )

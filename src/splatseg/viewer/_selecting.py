@@ -27,7 +27,7 @@ from splatseg.core import (
 from splatseg.errors import InputError
 from splatseg.prompting.next_click import next_click
 from splatseg.prompting.pipeline import SceneIndex
-from splatseg.prompting.prompts import Lasso, SelectionPrompt, ViewPrompt
+from splatseg.prompting.prompts import AxisBox, Ball, Lasso, SelectionPrompt, ViewPrompt
 from splatseg.prompting.seen import SeenPrompt
 from splatseg.render import BackendName
 from splatseg.selection import pieces
@@ -35,6 +35,7 @@ from splatseg.tasks.query import QuerySession
 from splatseg.tasks.select import SelectionSession, open_selector, prompt_record
 from splatseg.tasks.sources import QueryOptions, SelectOptions
 from splatseg.tasks.work import Observer, Work
+from splatseg.viewer._shaping import Mode
 from splatseg.viewer._state import MEMBER, Confidence
 
 COLOUR = "colour"
@@ -53,6 +54,9 @@ _POINTED_AT = 0.1
 
 _MAX_SEEDS = 16
 """Most Gaussians that were pointed at whose colours others are compared with."""
+
+_MAX_PROMPTS = 64
+"""Most prompts of a selection that are recorded, the last."""
 
 _IN, _OUT = 0.501, 0.499
 
@@ -248,8 +252,8 @@ class Selecting:
 
         made = selector.select(prompts, options=options, advise=False, draft=tell)
         self.seconds = dict(made.seconds)
-        places = not any(isinstance(prompt, ViewPrompt) for prompt in prompts)
-        source = "" if places and not made.source else (self.source or COLOUR)
+        places = all(isinstance(prompt, AxisBox | Ball | Lasso) for prompt in prompts)
+        source = "" if places else (self.source or COLOUR)
         return made.selection, {"source": source, "prompts": self._records(prompts, level)}
 
     def find_words(self, words: str) -> tuple[Selection, dict[str, Any]]:
@@ -346,6 +350,23 @@ class Selecting:
         return self._words
 
 
+def joined_record(
+    record: dict[str, Any], earlier: dict[str, Any] | None, mode: Mode
+) -> dict[str, Any]:
+    """The record of prompts behind those that they were combined with."""
+    how = {} if mode == "set" else {"mode": mode}
+    joined = recorded_after(earlier, [{**prompt, **how} for prompt in record["prompts"]])
+    return joined | {"source": record["source"] or joined.get("source", "")}
+
+
+def recorded_after(
+    earlier: dict[str, Any] | None, prompts: Sequence[dict[str, Any]]
+) -> dict[str, Any]:
+    """An earlier record with further prompts; of very many the last."""
+    before = earlier or {}
+    return {**before, "prompts": [*before.get("prompts", []), *prompts][-_MAX_PROMPTS:]}
+
+
 def front_view(gaussians: Gaussians, *, width: int = 320, height: int = 240) -> View:
     """A view of all Gaussians from along y, for scenes that have none."""
     means = gaussians.means.detach().cpu().double()
@@ -370,17 +391,18 @@ def front_view(gaussians: Gaussians, *, width: int = 320, height: int = 240) -> 
 
 def bytes_of(selection: Selection) -> Confidence:
     """Confidences of 0 to 255, from 128 on for what is selected."""
-    mask = selection.mask.cpu()
-    sure = mask.double() if selection.confidence is None else selection.confidence.cpu().double()
-    values = (sure * 255).round()
-    values = torch.where(mask, values.clamp_min(MEMBER), values.clamp_max(MEMBER - 1))
-    return values.to(torch.uint8).numpy()
+    # In NumPy: torch would wait for its threads, which costs more than it saves here.
+    mask = selection.mask.cpu().numpy()
+    if selection.confidence is None:
+        return np.where(mask, np.uint8(255), np.uint8(0))
+    values = np.rint(255 * selection.confidence.detach().cpu().numpy()).astype(np.uint8)
+    return np.where(mask, np.maximum(values, MEMBER), np.minimum(values, MEMBER - 1))
 
 
 def selection_of(confidence: Confidence) -> Selection:
     """The selection of confidences of 0 to 255. Inverse of `bytes_of`, up to a 255th."""
-    values = torch.from_numpy(np.array(confidence)).float() / 255
-    return Selection.of_confidence(values)
+    values = confidence.astype(np.float32) / 255
+    return Selection.of_confidence(torch.from_numpy(values))
 
 
 def _camera_record(camera: Camera) -> dict[str, Any]:

@@ -8,7 +8,6 @@
 What is done is in the journal when the method returns. A session is for one thread.
 """
 
-import hashlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import EllipsisType
@@ -26,43 +25,40 @@ from splatseg.core import (
     Selection,
     apply_rows,
 )
-from splatseg.errors import InputError, quoted
-from splatseg.io.scene import load_scene, save_scene_layer, scene_layer_names
+from splatseg.errors import InputError
+from splatseg.io.scene import load_scene
 from splatseg.io.scene_folder import scene_path
-from splatseg.io.splats import read_splats
+from splatseg.io.splats import WritableFormat, read_splats
 from splatseg.prompting.prompts import AxisBox, Ball, Lasso, SelectionPrompt, Similar, ViewPrompt
 from splatseg.render import BackendName
 from splatseg.tasks.work import SILENT, Observer
 from splatseg.viewer import _products as products
 from splatseg.viewer import _shaping as shaping
+from splatseg.viewer._editor import Callback, Editor
 from splatseg.viewer._journal import Journal
 from splatseg.viewer._masks import MaskStore
-from splatseg.viewer._selecting import Selecting, bytes_of, selection_of
+from splatseg.viewer._selecting import (
+    Selecting,
+    bytes_of,
+    joined_record,
+    recorded_after,
+    selection_of,
+)
 from splatseg.viewer._shaping import Mode, SplitBy
 from splatseg.viewer._state import (
-    MEMBER,
     Command,
     Confidence,
     Document,
-    Entry,
     History,
-    Key,
     Mask,
     Select,
     Split,
     Suggest,
-    changed_keys,
     free_name,
-    keys_of,
 )
 
 VIEW_FOLDER = "view"
 """Folder of a scene that holds the journal."""
-
-Callback = Callable[[Document, Document, str], None]
-
-_MAX_PROMPTS = 64
-"""Most prompts of a selection that are recorded, the last."""
 
 
 def open_session(
@@ -94,7 +90,7 @@ def open_session(
     journal = None
     if place is not None:
         count = len(scene.gaussians)
-        journal = Journal(place, gaussians=count, digest=_digest_of(scene))
+        journal = Journal(place, gaussians=count, digest=products.digest_of(scene))
         for note in journal.notes:
             observer.note(note)
     return Session(scene, journal=journal, folder=place, backend=backend, observer=observer)
@@ -123,15 +119,11 @@ class Session:
         observer: Observer = SILENT,
     ) -> None:
         self._scene = scene
-        self._journal = journal
         self._folder = folder
         self._backend: BackendName = backend
         self._observer = observer
-        self._masks = MaskStore(len(scene.gaussians)) if journal is None else journal.masks
-        self._history = History() if journal is None else journal.history
-        self._opened_at = self.revision
-        self._changes: dict[Key, dict[str, int]] = {}
-        self._callbacks: list[Callback] = []
+        self._editor = Editor(len(scene.gaussians), journal)
+        self._masks, self._history = self._editor.masks, self._editor.history
         self._selecting = Selecting(scene, backend=backend, observer=observer)
         self._owners = products.Owners(len(scene.gaussians), self._masks)
         self._edited: tuple[tuple[object, ...], Edited] | None = None
@@ -145,8 +137,7 @@ class Session:
     def close(self) -> None:
         """Release what it holds, and the lock of the journal."""
         self._selecting.close()
-        if self._journal is not None:
-            self._journal.close()
+        self._editor.close()
 
     @property
     def scene(self) -> Scene:
@@ -191,7 +182,7 @@ class Session:
     @property
     def notes(self) -> tuple[str, ...]:
         """What should be known of how the journal was opened."""
-        return () if self._journal is None else self._journal.notes
+        return self._editor.notes
 
     @property
     def source(self) -> str | None:
@@ -224,16 +215,7 @@ class Session:
         Not those that were removed, nor those of hidden objects; where objects are isolated,
         theirs alone.
         """
-        document = self.document
-        ids, _ = self._owners.of(document.objects)
-        hidden = [one.id for one in document.objects if not one.visible]
-        shown = ~np.isin(ids, hidden)
-        if document.isolated:
-            shown &= np.isin(ids, document.isolated)
-        for edit in document.edits:
-            if edit.kind == "remove":
-                shown &= self._masks.get(edit.mask) < MEMBER
-        return shown
+        return products.shown(self.document, self._owners, self._masks)
 
     def owners(self) -> NDArray[np.int32]:
         """(n,) the id of the object that each Gaussian belongs to, -1 for none.
@@ -252,13 +234,7 @@ class Session:
         Returns:
             A function that ends it.
         """
-        self._callbacks.append(callback)
-
-        def end() -> None:
-            if callback in self._callbacks:
-                self._callbacks.remove(callback)
-
-        return end
+        return self._editor.subscribe(callback)
 
     # Commands.
 
@@ -275,10 +251,7 @@ class Session:
             InputError: If it cannot be done; a sentence says why.
             OutputError: If it cannot be written down; nothing was done.
         """
-        if revision is not None:
-            self._check_unchanged(command, author, revision)
-        entry = self._history.checked(command, self._masks, author)
-        return self._written(entry.after, author, lambda: self._history.do(entry), entry=entry)
+        return self._editor.do(command, author=author, revision=revision)
 
     def undo(self, author: str = "") -> Document:
         """Take the last command back, whoever did it.
@@ -286,9 +259,7 @@ class Session:
         Raises:
             InputError: If there is nothing to undo.
         """
-        self._history.check_undo()
-        before = self._history.entries[-1].before
-        return self._written(before, author, self._history.undo)
+        return self._editor.undo(author)
 
     def redo(self, author: str = "") -> Document:
         """Do again what was undone last.
@@ -296,42 +267,7 @@ class Session:
         Raises:
             InputError: If there is nothing to redo.
         """
-        self._history.check_redo()
-        return self._written(self._history.next_redo.after, author, self._history.redo, redo=True)
-
-    def _written(
-        self,
-        after: Document,
-        author: str,
-        change: Callable[[], Document],
-        *,
-        entry: Entry | None = None,
-        redo: bool = False,
-    ) -> Document:
-        """Write a change down, make it, and tell of it."""
-        before = self.document
-        after = self._history.numbered(after)
-        if self._journal is not None:
-            command = None if entry is None else entry.command
-            self._journal.write(command, author=author, after=after, redo=redo)
-        change()
-        for key in changed_keys(before, after):
-            self._changes.setdefault(key, {})[author] = after.revision
-        for callback in tuple(self._callbacks):
-            callback(before, self.document, author)
-        return self.document
-
-    def _check_unchanged(self, command: Command, author: str, revision: int) -> None:
-        for key in keys_of(command):
-            changes = self._changes.get(key, {})
-            others = (at for who, at in changes.items() if not who or who != author)
-            last = max(others, default=self._opened_at)
-            if max(last, self._opened_at) > revision:
-                kind, id = key
-                name = "" if kind == "selection" else f" {id}"
-                raise InputError(
-                    f"{kind}{name}: it was changed since you saw it; look at it and try again."
-                )
+        return self._editor.redo(author)
 
     # Selecting.
 
@@ -390,7 +326,7 @@ class Session:
             given = (prompts,) if one else tuple(prompts)
             made, record = self._selecting.select(given, level=level, draft=tell)
         earlier = self.document.prompt if under == self.document.selection else None
-        record = _joined_record(record, None if below is None else earlier, mode)
+        record = joined_record(record, None if below is None else earlier, mode)
         mask = self._masks.put(shaping.combined(bytes_of(made), below, mode))
         return self.do(Select(mask if mask.count else None, record), author=author)
 
@@ -435,7 +371,8 @@ class Session:
         Raises:
             InputError: If nothing is selected, or nothing would be left.
         """
-        values = shaping.shrunk(self._selected(), self._selecting.neighbours, factor)
+        neighbours = self._selecting.neighbours
+        values = shaping.shrunk(self._selected(), self._scene.gaussians, neighbours, factor)
         return self._reselect(values, "shrink", factor, author)
 
     def fill_holes(self, *, author: str = "") -> Document:
@@ -456,10 +393,8 @@ class Session:
         self, values: Confidence, what: str, factor: float | None, author: str
     ) -> Document:
         step: dict[str, Any] = {"kind": what} | ({} if factor is None else {"factor": factor})
-        earlier = self.document.prompt or {}
-        prompts = [*earlier.get("prompts", []), step][-_MAX_PROMPTS:]
-        mask = self._masks.put(values)
-        return self.do(Select(mask, {**earlier, "prompts": prompts}), author=author)
+        record = recorded_after(self.document.prompt, [step])
+        return self.do(Select(self._masks.put(values), record), author=author)
 
     # Objects.
 
@@ -538,28 +473,26 @@ class Session:
             OutputError: If it cannot be written.
         """
         labels = self.labels()
-        root = self._scene.root
-        if root is None:
-            return labels
-        if name in scene_layer_names(root) and self._scene.layers[name].info.method != (
-            products.METHOD
-        ):
-            raise InputError(
-                f"layer: {quoted(name)} is there already and was not saved here; choose another "
-                "name."
-            )
-        save_scene_layer(labels, root, name)
+        if self._scene.root is not None:
+            products.save(labels, self._scene.root, name)
         return labels
 
     def export(
-        self, what: products.ExportWhat, name: str, ids: Iterable[int] | None = None
+        self,
+        what: products.ExportWhat,
+        name: str,
+        ids: Iterable[int] | None = None,
+        *,
+        format: WritableFormat | None = None,
     ) -> Path:
         """Write the scene with its edits, or objects of it, into its folder ``exports``.
 
         Args:
             what: splat, objects (a file each), points, coco or table.
-            name: Of the file or folder; its ending says the format, PLY without one.
+            name: Of the file or folder; its ending says the format.
             ids: Only these objects; None takes everything.
+            format: Of splats, where the name does not say it; None is PLY. Other formats hold no
+                labels.
 
         Returns:
             What was written.
@@ -580,6 +513,7 @@ class Session:
             products.exports_folder(self._scene, self._folder),
             what=what,
             name=name,
+            format=format,
             only=only,
             backend=self._backend,
             observer=self._observer,
@@ -599,21 +533,3 @@ class Session:
             made = products.edited(self._scene.gaussians, edits, self._masks)
             self._edited = edits, made
         return self._edited[1]
-
-
-def _joined_record(
-    record: dict[str, Any], earlier: dict[str, Any] | None, mode: Mode
-) -> dict[str, Any]:
-    """The record of prompts behind those that they were combined with."""
-    prompts = [
-        dict(prompt) if mode == "set" else {**prompt, "mode": mode} for prompt in record["prompts"]
-    ]
-    before = (earlier or {}).get("prompts", [])
-    source = record["source"] or (earlier or {}).get("source", "")
-    return {"source": source, "prompts": [*before, *prompts][-_MAX_PROMPTS:]}
-
-
-def _digest_of(scene: Scene) -> str:
-    """Tells the Gaussians of a scene from those of others: a digest of their centres."""
-    means = scene.gaussians.means.detach().cpu().float().contiguous().numpy()
-    return hashlib.blake2b(means.astype("<f4").tobytes(), digest_size=16).hexdigest()

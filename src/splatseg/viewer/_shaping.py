@@ -20,8 +20,8 @@ SplitBy = Literal["parts", "tree", "plane"]
 
 _MAX_FACTOR = 100.0
 
-_MAX_NEIGHBOURS = 64
-"""Most neighbours that are asked whether they are outside when a selection shrinks."""
+_ROUNDING = 1e-5
+"""What is as far as a distance is within it."""
 
 _MIN_PART, _MIN_SHARE = 8, 0.02
 """Least Gaussians of a part of a split, and least share of those of the thing; what is less goes
@@ -58,18 +58,23 @@ def grown(values: Confidence, neighbours: SceneIndex, factor: float) -> Confiden
     return np.where(near, np.uint8(255), values)
 
 
-def shrunk(values: Confidence, neighbours: SceneIndex, factor: float) -> Confidence:
+def shrunk(
+    values: Confidence, gaussians: Gaussians, neighbours: SceneIndex, factor: float
+) -> Confidence:
     """Without what is near to the outside; `factor` as in `grown`.
 
     Raises:
         InputError: If the factor is not above 0, or very large, or nothing would be left.
     """
     subset, radius = _around(values, neighbours, factor)
-    rows = torch.nonzero(subset.members).squeeze(1)
-    lists = neighbours.index.others_within(radius, rows=rows, max_neighbours=_MAX_NEIGHBOURS)
-    outside = ~subset.members[lists.indices.long()]
+    inside, means = subset.members, gaussians.means.detach().cpu()
+    # Only what lies about the selection can be near to it.
+    low, high = means[inside].amin(dim=0) - radius, means[inside].amax(dim=0) + radius
+    around = ~inside & ((means >= low) & (means <= high)).all(dim=1)
     smaller = values.copy()
-    smaller[rows[torch.unique(lists.queries[outside].long())].numpy()] = 0
+    if bool(around.any()):
+        nearest = NeighbourIndex(means[around]).nearest(means[inside], 1).distances[:, 0]
+        smaller[torch.nonzero(inside).squeeze(1)[nearest <= radius].numpy()] = 0
     if not (smaller >= MEMBER).any():
         raise InputError("shrink: nothing would be left of the selection.")
     return smaller
@@ -94,7 +99,7 @@ def _around(values: Confidence, neighbours: SceneIndex, factor: float) -> tuple[
         # One Gaussian, or several in one place: the distance to the next one of the scene.
         rows = torch.nonzero(subset.members).squeeze(1)
         radius = float(index.nearest_others(1, rows=rows).distances.max())
-    return subset, factor * radius
+    return subset, factor * radius * (1 + _ROUNDING)
 
 
 def numbered_parts(

@@ -446,8 +446,7 @@ class History:
         Raises:
             InputError: If there is nothing to undo.
         """
-        self.check_undo()
-        return self._moved(self._done, self._undone, self._done[-1].before)
+        return self._moved(self._done, self._undone, self.next_undo.before)
 
     def redo(self) -> Document:
         """Do again what was undone last.
@@ -455,18 +454,18 @@ class History:
         Raises:
             InputError: If there is nothing to redo.
         """
-        self.check_redo()
-        return self._moved(self._undone, self._done, self._undone[-1].after)
+        return self._moved(self._undone, self._done, self.next_redo.after)
 
-    def check_undo(self) -> None:
-        """Raise `InputError` where there is nothing to undo."""
+    @property
+    def next_undo(self) -> Entry:
+        """What undoing would take back.
+
+        Raises:
+            InputError: If there is nothing to undo.
+        """
         if not self._done:
             raise InputError("undo: there is nothing to undo.")
-
-    def check_redo(self) -> None:
-        """Raise `InputError` where there is nothing to redo."""
-        if not self._undone:
-            raise InputError("redo: there is nothing to redo.")
+        return self._done[-1]
 
     @property
     def next_redo(self) -> Entry:
@@ -475,7 +474,8 @@ class History:
         Raises:
             InputError: If there is nothing to redo.
         """
-        self.check_redo()
+        if not self._undone:
+            raise InputError("redo: there is nothing to redo.")
         return self._undone[-1]
 
     def numbered(self, document: Document) -> Document:
