@@ -252,7 +252,7 @@ def test_the_browser_is_opened_where_there_is_a_screen(things, run, monkeypatch)
     status, text, _ = run("view", things)
     assert status == 0
     assert len(shown) == 1
-    assert opened[0] in text
+    assert shown[0] in text
     assert run("view", things, "--no-open")[0] == 0
     assert len(shown) == 1
 

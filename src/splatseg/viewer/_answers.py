@@ -548,7 +548,7 @@ class SceneAnswers:
             camera = msgspec.structs.replace(given.camera, matrix=matrix).camera()
             return self._picture(given, camera, None, job.client).rgb
 
-        return jobs.write_film(frame, given.frames, self._export_folder(), given.name, job)
+        return jobs.write_film(frame, given.frames, job, self._export_folder(), given.name)
 
     def _export_folder(self) -> Path:
         root = self._session.scene.root

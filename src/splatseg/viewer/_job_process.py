@@ -44,10 +44,10 @@ class _Lines(Observer):
             self._write(done, total, stage)
 
     def _write(self, done: int, total: int, text: str) -> None:
-        write_line(self._out, {"done": done, "total": total, "text": text})
+        _say(self._out, {"done": done, "total": total, "text": text})
 
 
-def write_line(out: TextIO, value: dict[str, Any]) -> None:
+def _say(out: TextIO, value: dict[str, Any]) -> None:
     """One line of JSON, at once."""
     out.write(msgspec.json.encode(value).decode() + "\n")
     out.flush()
@@ -97,9 +97,9 @@ def main(words: list[str], given: TextIO, out: TextIO) -> int:
         arguments = msgspec.json.decode(given.read(), type=dict[str, Any])
         text = _WORK[name](Path(root), arguments, backend, _Lines(out))  # pyright: ignore[reportArgumentType]
     except SplatsegError as error:
-        write_line(out, {"error": str(error)})
+        _say(out, {"error": str(error)})
         return 2
-    write_line(out, {"text": text})
+    _say(out, {"text": text})
     return 0
 
 

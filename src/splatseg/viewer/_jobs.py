@@ -118,16 +118,16 @@ def write_still(rgb: NDArray[np.uint8], folder: Path, name: str) -> Path:
 
 
 def write_film(
-    frame: Callable[[float], NDArray[np.uint8]], count: int, folder: Path, name: str, job: Job
+    frame: Callable[[float], NDArray[np.uint8]], count: int, job: Job, folder: Path, name: str
 ) -> Path:
     """Pictures of a turn as a film.
 
     Args:
         frame: Draws the picture at a share of the turn.
         count: How many.
+        job: Is told of the progress.
         folder: Folder of exports.
         name: Of the file, without its ending.
-        job: Is told of the progress.
     """
     path = free_file(folder, name, ".mp4")
 

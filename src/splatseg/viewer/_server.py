@@ -56,8 +56,9 @@ class ViewServer:
         port: int = 0,
         embedded: bool = False,
     ) -> None:
-        for name in ("starlette", "uvicorn", "websockets"):
-            import_package(name, "the viewer", "viewer")
+        import_package("starlette", "the viewer", "viewer")
+        import_package("uvicorn", "the viewer", "viewer")
+        import_package("websockets", "the viewer", "viewer")
         self.worker = worker
         self._listening = _listen(host, port)
         self.access = guard.Access(
