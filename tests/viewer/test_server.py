@@ -132,6 +132,12 @@ def test_a_click_is_answered_twice_and_drawn(page) -> None:
     assert 0.5 <= final["confidence"] <= 1
     assert final["milliseconds"] >= draft["milliseconds"] > 0
     assert "draft" in final["stages"]
+    kinds = [
+        one["stage"] if isinstance(one, dict) else one[:1]
+        for one in page.heard
+        if isinstance(one, bytes) or one["type"] == "selected"
+    ]
+    assert kinds[-3:] == ["draft", b"F", "final"], "the draft is drawn before the rest is done"
     patch = next(one for one in page.heard if isinstance(one, dict) and one["type"] == "patch")
     assert patch["selection"]["count"] == final["count"]
     np.testing.assert_allclose(patch["selection"]["centre"], [-1, 0, 0], atol=0.2)
@@ -190,6 +196,11 @@ def test_a_selection_grows_shrinks_and_turns_round(page) -> None:
     assert page.select(5, "invert")["count"] == 3 * EACH - filled
 
 
+def test_more_of_the_same_is_what_the_layer_says_is_alike(page) -> None:
+    page.select(1, points=[RED_PIXEL])
+    assert page.select(2, "similar")["count"] == pytest.approx(EACH, abs=15)
+
+
 @pytest.mark.parametrize(
     ("kind", "fields", "words"),
     [
@@ -203,6 +214,8 @@ def test_a_selection_grows_shrinks_and_turns_round(page) -> None:
         ("grow", {}, "selection"),
         ("similar", {}, "selection"),
         ("layer", {"text": "../things"}, "layer"),
+        ("box", {"box": [5, 5, 5, 5]}, "x0 < x1"),
+        ("stroke", {"points": [[-50, -50], [-60, -60]]}, "got none"),
         ("layer", {"text": "things"}, "expected a selection"),
         ("words", {"text": "mug"}, ""),
         ("click", {"points": [RED_PIXEL], "mode": "intersect"}, "select something first"),

@@ -6,16 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-import cv2
 import msgspec
 import numpy as np
-import torch
-from numpy.typing import NDArray
 
-from splatseg.core import Camera, Scene, Selection, View
+from splatseg.core import Scene, Selection
 from splatseg.errors import InputError
-from splatseg.io.scene_folder import scene_path
-from splatseg.prompting.prompts import Ball, Lasso, SelectionPrompt, Similar, ViewPrompt
 from splatseg.render import BackendName
 from splatseg.tasks.work import EXPORTS_FOLDER
 from splatseg.viewer import _jobs as jobs
@@ -37,6 +32,9 @@ from splatseg.viewer._document import (
 )
 from splatseg.viewer._draw import Drawer, Pace
 from splatseg.viewer._mirror import Mirror, scene_info, view_infos
+from splatseg.viewer._pictures import Pictures
+from splatseg.viewer._prompts import prompts_of
+from splatseg.viewer._selecting import bytes_of
 from splatseg.viewer._session import Session, open_session
 from splatseg.viewer._shaping import combined
 from splatseg.viewer._worker import Client, Job, Worker
@@ -45,11 +43,6 @@ T = TypeVar("T")
 
 _MODES = ("colour", "objects", "blend", "confidence", "depth", "pca", "similarity")
 _MOVING_QUALITY, _REST_QUALITY = 75, 92
-_NO_NAME = "page"
-"""Name of a view that is no photograph's."""
-
-_MAX_OBJECT = 32766
-_FIRST_SUGGESTION = 32768
 
 
 @dataclass
@@ -92,14 +85,21 @@ class SceneAnswers:
         self._session = session
         self._drawer = drawer
         self._worker = worker
-        self._relay = relay
-        self._backend: BackendName = backend
         self._fitting = fitting
         self._ready = False
         self._mirror = Mirror(session.scene, session.confidence)
         self._scene_info = scene_info(session.scene, name)
         self._views = view_infos(session.scene)
-        self._look: _Look | None = None
+        self._pictures = Pictures(session, drawer)
+        self._jobs = jobs.SceneJobs(
+            session,
+            pictures=self._pictures,
+            mirror=self._mirror,
+            worker=worker,
+            relay=relay,
+            backend=backend,
+            layers_changed=self._send_states,
+        )
         session.subscribe(self._changed)
 
     @property
@@ -169,10 +169,9 @@ class SceneAnswers:
 
     def draw(self, client: Client, request: messages.DrawRequest) -> None:
         """Send a picture, and at rest the id map."""
-        self._send_picture(client, request, self._selection())
+        self._send_picture(client, request, self._pictures.selection)
         if request.rest and request.ids:
-            look = self._current_look()
-            ids = self._drawer.id_map(request.camera(), look.ids(), shown=self._shown(request))
+            ids = self._pictures.id_map(request)
             client.send_bytes(messages.id_map_bytes(request.id, ids))
 
     def _send_picture(
@@ -180,7 +179,13 @@ class SceneAnswers:
     ) -> None:
         pace = _memory(client).pace
         scale = 1.0 if request.rest else pace.scale
-        picture = self._picture(request, request.camera(), selection, client, scale=scale)
+        picture = self._pictures.picture(
+            request,
+            request.camera(),
+            selection=selection,
+            words=_memory(client).words,
+            scale=scale,
+        )
         if not request.rest:
             pace.took(picture.seconds)
         began = time.perf_counter()
@@ -195,49 +200,6 @@ class SceneAnswers:
                 rest=request.rest,
             )
         )
-
-    def _picture(
-        self,
-        request: messages.DrawRequest | messages.Still,
-        camera: Camera,
-        selection: Confidence | None,
-        client: Client,
-        *,
-        scale: float = 1.0,
-    ) -> Any:
-        wants_objects = request.mode in ("objects", "blend")
-        return self._drawer.picture(
-            camera,
-            mode=request.mode,
-            selection=selection,
-            objects=self._current_look().objects if wants_objects else (),
-            shown=self._shown(request),
-            similarity=self._similarity(client) if request.mode == "similarity" else None,
-            scale=scale,
-        )
-
-    def _selection(self) -> Confidence | None:
-        mask = self._session.document.selection
-        return None if mask is None else self._session.confidence(mask)
-
-    def _shown(self, request: messages.DrawRequest | messages.Still) -> NDArray[np.bool_] | None:
-        only = request.only if isinstance(request, messages.DrawRequest) else None
-        if only is None:
-            return self._current_look().shown
-        return self._session.confidence(self._session.document.object(only).mask) >= MEMBER
-
-    def _similarity(self, client: Client) -> NDArray[np.float32] | None:
-        words = _memory(client).words
-        if words:
-            return self._session.similarity(words)
-        selection = self._selection()
-        return None if selection is None else selection.astype(np.float32) / 255
-
-    def _current_look(self) -> "_Look":
-        revision = self._session.document.revision
-        if self._look is None or self._look.revision != revision:
-            self._look = _Look(self._session, self._look)
-        return self._look
 
     # Messages.
 
@@ -255,8 +217,9 @@ class SceneAnswers:
                 _memory(client).gesture = None
                 self._session.redo(author=client.author)
             case messages.DepthRequest():
-                point = self._drawer.depth(message.camera.camera(), message.x, message.y)
-                client.send(messages.PointAnswer(gesture=message.gesture, point=_triple(point)))
+                found = self._drawer.depth(message.camera.camera(), message.x, message.y)
+                point = None if found is None else [float(value) for value in found]
+                client.send(messages.PointAnswer(gesture=message.gesture, point=point))
             case messages.Hello():
                 raise InputError("hello: was said before.")
             case _:
@@ -286,7 +249,7 @@ class SceneAnswers:
                 self._send_picture(client, client.camera, confidence)
 
         self._select_by(client, request, memory, draft)
-        selection = self._selection()
+        selection = self._pictures.selection
         stages |= {name: round(1e3 * spent, 1) for name, spent in self._session.seconds.items()}
         self._send_selected(client, request, "final", selection, stages=stages, began=began)
 
@@ -310,11 +273,10 @@ class SceneAnswers:
             case "fill":
                 session.fill_holes(author=author)
             case _:
-                prompts = request.text if request.kind == "words" else self._prompts(request)
-                if request.kind == "words":
-                    memory.words = request.text
+                words = request.text if request.kind == "words" else ""
+                memory.words = words or memory.words
                 session.select(
-                    prompts,
+                    words or prompts_of(request, session.scene, self._drawer, session.selected),
                     mode=request.mode,
                     level=request.level,
                     base=memory.base,
@@ -331,10 +293,9 @@ class SceneAnswers:
                 raise InputError(
                     "layer: expected a selection, got another kind of layer; suggest its objects."
                 )
-            confidence = layer.mask.float() if layer.confidence is None else layer.confidence
-            return (confidence * 255).round().to(torch.uint8).numpy()
+            return bytes_of(layer)
         whole = np.full(len(scene.gaussians), 255, dtype=np.uint8)
-        before = self._selection() if request.kind == "invert" else None
+        before = self._pictures.selection if request.kind == "invert" else None
         return whole if before is None else np.where(before >= MEMBER, 0, whole).astype(np.uint8)
 
     def _select_mask(
@@ -371,47 +332,6 @@ class SceneAnswers:
                 stages=dict(stages),
             )
         )
-
-    def _prompts(self, request: messages.SelectRequest) -> Sequence[SelectionPrompt]:
-        """What a person showed, as prompts."""
-        if request.kind == "similar":
-            selection = self._selection()
-            if selection is None:
-                raise InputError("similar: expected a selection that others are like; click first.")
-            return [Similar(Selection.of_confidence(torch.from_numpy(selection / np.float32(255))))]
-        view = self._view(request)
-        if request.kind == "sphere":
-            return [self._ball(request, view)]
-        if request.kind in ("lasso", "polygon"):
-            return [Lasso(view=view, polygon=_points(request.points))]
-        if request.kind == "stroke":
-            return [_stroke(request, view)]
-        points = [*request.points, *request.negative] if request.kind == "click" else []
-        positive = [True] * len(request.points) + [False] * len(request.negative)
-        box = None if request.box is None else torch.tensor(request.box, dtype=torch.float32)
-        return [
-            ViewPrompt(
-                view=view,
-                points=_points(points),
-                positive=torch.tensor(positive[: len(points)], dtype=torch.bool),
-                box=box,
-            )
-        ]
-
-    def _view(self, request: messages.SelectRequest) -> View:
-        if request.view is not None:
-            return self._session.scene.view(request.view)
-        if request.camera is None:
-            raise InputError(f"{request.kind}: expected a camera or a view, got neither.")
-        return View(name=_NO_NAME, camera=request.camera.camera())
-
-    def _ball(self, request: messages.SelectRequest, view: View) -> Ball:
-        if not request.points or request.radius is None:
-            raise InputError("sphere: expected a point and a radius.")
-        centre = _triple(self._drawer.depth(view.camera, *request.points[0]))
-        if centre is None:
-            raise InputError("sphere: there is nothing of the scene at this pixel; click on it.")
-        return Ball(centre=centre, radius=request.radius)
 
     # Commands.
 
@@ -497,126 +417,12 @@ class SceneAnswers:
 
     def run(self, job: Job) -> None:
         """Do a job, or begin it in a process of its own."""
-        given = messages.arguments(job.request)
-        if isinstance(given, messages.See | messages.Associate):
-            root = self._session.scene.root
-            jobs.start_process(job, root, self._backend, given, lambda end: self._ended(job, end))
-            return
-        with self._relay.telling(job):
-            file, text = self._do(job, given)
-        self._worker.end_job(
-            job,
-            messages.Finished(
-                id=job.id, result={"file": None if file is None else file.name, "text": text}
-            ),
-        )
-
-    def _do(self, job: Job, given: Any) -> tuple[Path | None, str]:
-        """The file and the sentence that a job ends with."""
-        session = self._session
-        match given:
-            case messages.Export():
-                ids = None if given.ids is None else tuple(given.ids)
-                name = given.name if given.format is None else f"{given.name}.{given.format}"
-                path = session.export(given.what, name, ids=ids)
-                return (jobs.zipped(path) if path.is_dir() else path), "exported"
-            case messages.SaveLayer():
-                session.save_layer(given.name)
-                self._send_states()
-                return None, f"saved as layer {given.name}"
-            case messages.Suggest():
-                session.suggest(given.layer, author=job.client.author)
-                return None, f"{len(session.document.suggestions)} suggestions"
-            case messages.Film():
-                return self._film(job, given), f"{given.frames} frames"
-            case messages.Still():
-                picture = self._picture(given, given.camera.camera(), None, job.client)
-                return jobs.write_still(picture.rgb, self._export_folder(), given.name), "picture"
-            case _:
-                raise InputError(f"job: {job.request.name} cannot be done here.")
-
-    def _film(self, job: Job, given: messages.Film) -> Path:
-        centre, _ = self._mirror.centre(self._session.document.selection)
-        turn = jobs.Turntable(
-            matrix=np.array(given.camera.matrix).reshape(4, 4),
-            centre=np.array(centre),
-            up=np.array(self._scene_info.up),
-        )
-
-        def frame(share: float) -> NDArray[np.uint8]:
-            matrix = turn.at(share).ravel().tolist()
-            camera = msgspec.structs.replace(given.camera, matrix=matrix).camera()
-            return self._picture(given, camera, None, job.client).rgb
-
-        return jobs.write_film(frame, given.frames, job, self._export_folder(), given.name)
-
-    def _export_folder(self) -> Path:
-        root = self._session.scene.root
-        if root is None:
-            raise InputError("export: expected a scene with a folder; save it first.")
-        return scene_path(root, EXPORTS_FOLDER, "file").parent
-
-    def _ended(self, job: Job, ending: messages.Finished | messages.Error) -> None:
-        """A process has ended; called in another thread."""
-
-        def tell(_: object) -> None:
-            if isinstance(ending, messages.Finished):
-                self._session.reopen()
-                self._send_states()
-            self._worker.end_job(job, ending)
-
-        if self._worker.call(tell).cancelled():
-            self._worker.end_job(job, ending)
+        self._jobs.run(job)
 
     def _send_states(self) -> None:
         for client in self._worker.clients:
             if client.welcomed:
                 client.send(self.state(client))
-
-
-class _Look:
-    """What pictures of one document are drawn from."""
-
-    def __init__(self, session: Session, before: "_Look | None") -> None:
-        document = session.document
-        self.revision = document.revision
-        self._session = session
-        self._document = document
-        self.shown: NDArray[np.bool_] = session.visible
-        self._owners: NDArray[np.int32] | None = None
-        self._ids: NDArray[np.int32] | None = None
-        if before is not None and before.same_objects(document):
-            self._owners, self._ids = before._owners, before._ids
-
-    def same_objects(self, document: Document) -> bool:
-        """Whether a document has the same objects and suggestions."""
-        mine = self._document
-        return mine.objects == document.objects and mine.suggestions == document.suggestions
-
-    @property
-    def owners(self) -> NDArray[np.int32]:
-        """The object of each Gaussian, -1 for none."""
-        if self._owners is None:
-            self._owners = self._session.owners()
-        return self._owners
-
-    @property
-    def objects(self) -> list[tuple[NDArray[np.bool_], tuple[int, int, int]]]:
-        """Which Gaussians each object has, and its colour."""
-        owners = self.owners
-        return [(owners == one.id, one.colour) for one in self._document.objects]
-
-    def ids(self) -> NDArray[np.int32]:
-        """The id of each Gaussian in an id map, as the protocol has it."""
-        if self._ids is None:
-            owners = self.owners
-            ids = np.where(owners <= _MAX_OBJECT, owners + 1, 0).astype(np.int32)
-            for one in self._document.suggestions:
-                if one.id < _FIRST_SUGGESTION:
-                    member = self._session.confidence(one.mask) >= MEMBER
-                    ids[member & (owners < 0)] = _FIRST_SUGGESTION + one.id
-            self._ids = ids
-        return self._ids
 
 
 def _or(otherwise: T, question: Callable[[], T]) -> T:
@@ -633,33 +439,6 @@ def _memory(client: Client) -> _Memory:
 
 def _milliseconds(began: float) -> float:
     return round(1e3 * (time.perf_counter() - began), 1)
-
-
-def _triple(point: Any) -> tuple[float, float, float] | None:
-    if point is None:
-        return None
-    x, y, z = (float(value) for value in point)
-    return x, y, z
-
-
-def _points(points: Sequence[messages.Point]) -> torch.Tensor:
-    return torch.tensor(points, dtype=torch.float32).reshape(-1, 2)
-
-
-def _stroke(request: messages.SelectRequest, view: View) -> ViewPrompt:
-    """Strokes as the pixels that they cover."""
-    drawn = [_covered(points, request.width, view) for points in (request.points, request.negative)]
-    positive, negative = (mask if bool(mask.any()) else None for mask in drawn)
-    return ViewPrompt(view=view, scribble=positive, negative_scribble=negative)
-
-
-def _covered(points: Sequence[messages.Point], width: float, view: View) -> torch.Tensor:
-    canvas = np.zeros((view.camera.height, view.camera.width), dtype=np.uint8)
-    if points:
-        # Pixel centres are at +0.5 here, at whole numbers in OpenCV.
-        corners = np.round(np.array(points) - 0.5).astype(np.int32).reshape(-1, 1, 2)
-        cv2.polylines(canvas, [corners], isClosed=False, color=1, thickness=max(1, round(width)))
-    return torch.from_numpy(canvas > 0)
 
 
 def opener(

@@ -23,9 +23,14 @@ from typing_extensions import override
 from splatseg.errors import InputError
 from splatseg.io.atomic import atomic_file, path_inside
 from splatseg.io.images import write_png, write_video
-from splatseg.tasks.work import Observer
+from splatseg.io.scene_folder import scene_path
+from splatseg.render import BackendName
+from splatseg.tasks.work import EXPORTS_FOLDER, Observer
 from splatseg.viewer import _messages as messages
-from splatseg.viewer._worker import Job, error_message
+from splatseg.viewer._mirror import Mirror
+from splatseg.viewer._pictures import Pictures
+from splatseg.viewer._session import Session
+from splatseg.viewer._worker import Job, Worker, error_message
 
 _FRAMES_A_SECOND = 24.0
 _POLL_SECONDS = 0.2
@@ -53,15 +58,8 @@ class Relay(Observer):
 
     @override
     def progress(self, stage: str, done: int, total: int) -> None:
-        job = self.job
-        if job is None:
-            return
-        # What is answered meanwhile is not this job's.
-        self.job = None
-        try:
-            job.step(done, total, stage)
-        finally:
-            self.job = job
+        if self.job is not None:
+            self.job.step(done, total, stage)
 
 
 def free_file(folder: Path, name: str, ending: str) -> Path:
@@ -220,3 +218,105 @@ def _end_if_cancelled(job: Job, process: "subprocess.Popen[str]") -> None:
             return
         with contextlib.suppress(subprocess.TimeoutExpired):
             process.wait(timeout=_POLL_SECONDS)
+
+
+class SceneJobs:
+    """The jobs of a session.
+
+    Args:
+        session: The session.
+        pictures: Draw its document.
+        mirror: Knows where things are.
+        worker: Is told of the end of each job.
+        relay: The observer of the session.
+        backend: Rendering backend.
+        layers_changed: Called when there may be other layers than before.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        *,
+        pictures: Pictures,
+        mirror: Mirror,
+        worker: Worker,
+        relay: Relay,
+        backend: BackendName,
+        layers_changed: Callable[[], None],
+    ) -> None:
+        self._session = session
+        self._pictures = pictures
+        self._mirror = mirror
+        self._worker = worker
+        self._relay = relay
+        self._backend: BackendName = backend
+        self._layers_changed = layers_changed
+
+    def run(self, job: Job) -> None:
+        """Do a job, or begin it in a process of its own."""
+        given = messages.arguments(job.request)
+        if isinstance(given, messages.See | messages.Associate):
+            root = self._session.scene.root
+            start_process(job, root, self._backend, given, lambda end: self._ended(job, end))
+            return
+        with self._relay.telling(job):
+            file, text = self._do(job, given)
+        result = {"file": None if file is None else file.name, "text": text}
+        self._worker.end_job(job, messages.Finished(id=job.id, result=result))
+
+    def _do(self, job: Job, given: Any) -> tuple[Path | None, str]:
+        """The file and the sentence that a job ends with."""
+        session = self._session
+        match given:
+            case messages.Export():
+                ids = None if given.ids is None else tuple(given.ids)
+                name = given.name if given.format is None else f"{given.name}.{given.format}"
+                path = session.export(given.what, name, ids=ids)
+                return (zipped(path) if path.is_dir() else path), "exported"
+            case messages.SaveLayer():
+                session.save_layer(given.name)
+                self._layers_changed()
+                return None, f"saved as layer {given.name}"
+            case messages.Suggest():
+                session.suggest(given.layer, author=job.client.author)
+                return None, f"{len(session.document.suggestions)} suggestions"
+            case messages.Film():
+                return self._film(job, given), f"{given.frames} frames"
+            case messages.Still():
+                picture = self._pictures.picture(given, given.camera.camera(), selection=None)
+                return write_still(picture.rgb, self._folder(), given.name), "picture"
+            case _:
+                raise InputError(f"job: {job.request.name} cannot be done here.")
+
+    def _film(self, job: Job, given: messages.Film) -> Path:
+        centre, _ = self._mirror.centre(self._session.document.selection)
+        turn = Turntable(
+            matrix=np.array(given.camera.matrix).reshape(4, 4),
+            centre=np.array(centre),
+            up=np.array(self._session.scene.up or (0.0, 0.0, 1.0)),
+        )
+
+        def frame(share: float) -> NDArray[np.uint8]:
+            matrix = turn.at(share).ravel().tolist()
+            camera = msgspec.structs.replace(given.camera, matrix=matrix).camera()
+            return self._pictures.picture(given, camera, selection=None).rgb
+
+        return write_film(frame, given.frames, job, self._folder(), given.name)
+
+    def _folder(self) -> Path:
+        root = self._session.scene.root
+        if root is None:
+            raise InputError("export: expected a scene with a folder; save it first.")
+        return scene_path(root, EXPORTS_FOLDER, "file").parent
+
+    def _ended(self, job: Job, ending: messages.Finished | messages.Error) -> None:
+        """A process has ended; called in another thread."""
+
+        def tell(_: object) -> None:
+            if isinstance(ending, messages.Finished):
+                self._session.reopen()
+                self._layers_changed()
+            self._worker.end_job(job, ending)
+
+        if self._worker.call(tell).cancelled():
+            self._worker.end_job(job, ending)

@@ -169,7 +169,7 @@ class PointAnswer(_Outgoing, kw_only=True, tag_field="type", tag="point"):
     """A point of the scene, or none."""
 
     gesture: int
-    point: tuple[float, float, float] | None
+    point: list[float] | None
 
 
 class HintAnswer(_Outgoing, kw_only=True, tag_field="type", tag="hint"):

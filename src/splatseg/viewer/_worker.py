@@ -87,6 +87,7 @@ class Job:
         self.request = request
         self.cancelled = False
         self._worker = worker
+        self._breathing = False
 
     @property
     def id(self) -> int:
@@ -99,16 +100,14 @@ class Job:
         Raises:
             Cancelled: If the job was cancelled.
         """
+        if self._breathing:  # what is answered meanwhile has steps, too
+            return
         self.client.send(messages.Progress(id=self.id, done=done, total=total, text=text))
-        self.breathe()
-
-    def breathe(self) -> None:
-        """Let the worker answer what is asked meanwhile.
-
-        Raises:
-            Cancelled: If the job was cancelled.
-        """
-        self._worker.breathe()
+        self._breathing = True
+        try:
+            self._worker.breathe()
+        finally:
+            self._breathing = False
         if self.cancelled or self._worker.closing:
             raise Cancelled
 
