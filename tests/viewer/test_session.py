@@ -160,9 +160,9 @@ def test_a_click_selects_the_piece_of_its_colour(session, ids, field) -> None:
 
 
 def test_alike_is_less_for_parts_and_more_for_groups(scene) -> None:
-    """Stripes whose colours are 0.17, 0.3 and 0.6 from the first."""
+    """Stripes whose colours are 0.25, 0.5 and 0.85 from the first."""
     column = ((scene.gaussians.means[:, 0] + 2.5) / 1.25).long().clamp(0, 3)
-    red = torch.tensor([0.1, 0.27, 0.4, 0.7])[column]
+    red = torch.tensor([0.1, 0.35, 0.6, 0.95])[column]
     sh = scene.gaussians.sh.clone()
     sh[:, 0] = (torch.stack((red, red * 0, red * 0), 1) - 0.5) / 0.28209479
     striped = replace(scene, gaussians=scene.gaussians.replace(sh=sh))

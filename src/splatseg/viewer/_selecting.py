@@ -46,7 +46,7 @@ Draft = Callable[[Confidence], None]
 _ANSWERING = ("objects", "voxels", "features")
 """Methods whose layers answer words, the best first."""
 
-_WIDEST, _FINEST = 0.38, 0.06
+_WIDEST, _FINEST = 0.62, 0.10
 """Distances of colours in [0, 1] that are alike to a group, and to the finest part."""
 
 _POINTED_AT = 0.1
