@@ -17,6 +17,7 @@ import tyro
 from splatseg.cli._shared import Backend, Data, Printing, print_result
 from splatseg.core import Capture
 from splatseg.errors import InputError, MissingFileError
+from splatseg.io.atomic import check_writable
 from splatseg.io.captures import read_capture
 from splatseg.io.scene import load_scene
 from splatseg.io.scene_folder import is_scene, is_unfinished
@@ -119,6 +120,8 @@ def _scene_folder(command: Command) -> Generator[Path]:
     if not path.exists():
         raise MissingFileError(f"{path}: there is no such scene, file or folder.")
     if not path.is_file():
+        if is_scene(path):
+            check_writable(path)  # what is done there is kept in it
         yield path
         return
     if command.output is not None:
