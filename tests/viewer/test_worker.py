@@ -132,6 +132,18 @@ def test_the_newest_camera_of_each_page_is_drawn_page_by_page(worker, noted) -> 
     assert settled(worker, noted) == [("draw", 1, 4), ("draw", 2, 14)]
 
 
+def test_a_change_is_drawn_first_for_who_made_it(worker, noted) -> None:
+    pages = [joined(worker) for _ in range(3)]
+    settled(worker, noted)
+    for page in pages[:2]:
+        worker.give(page, camera(page.id))
+    assert len(settled(worker, noted)) == 2
+    worker.call(lambda _: worker.redraw("2")).result(10)
+    assert settled(worker, noted) == [("draw", 2, 2), ("draw", 1, 1)]
+    assert pages[0].camera is not None
+    assert pages[0].camera.rest
+
+
 def test_between_two_rounds_of_cameras_one_message_is_answered(worker, noted) -> None:
     first, second = joined(worker), joined(worker)
     held(worker, noted, first)

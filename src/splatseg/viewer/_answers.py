@@ -87,6 +87,10 @@ class SceneAnswers:
         self._worker = worker
         self._fitting = fitting
         self._ready = False
+        self._cleaning = float("inf")
+        """Seconds that a Gaussian of the last selection took from its draft on."""
+        self._drawing = 0.0
+        """Seconds of the last picture at rest."""
         self._mirror = Mirror(session.scene, session.confidence)
         self._scene_info = scene_info(session.scene, name)
         self._views = view_infos(session.scene)
@@ -163,7 +167,7 @@ class SceneAnswers:
                 author=author,
             )
         )
-        self._worker.redraw()
+        self._worker.redraw(author)
 
     # Pictures.
 
@@ -186,7 +190,9 @@ class SceneAnswers:
             words=_memory(client).words,
             scale=scale,
         )
-        if not request.rest:
+        if request.rest:
+            self._drawing = picture.seconds
+        else:
             pace.took(picture.seconds)
         began = time.perf_counter()
         jpeg = self._drawer.jpeg(picture, _REST_QUALITY if request.rest else _MOVING_QUALITY)
@@ -242,14 +248,22 @@ class SceneAnswers:
             memory.gesture, memory.base = request.gesture, self._session.document.selection
         stages: dict[str, float] = {}
 
+        drafted: list[float] = []
+
         def draft(confidence: Confidence) -> None:
             stages["draft"] = _milliseconds(began)
             self._send_selected(client, request, "draft", confidence, stages=stages, began=began)
-            if client.camera is not None and not client.busy:
+            # A picture that takes longer than the cleaning would only delay the final one.
+            worth = self._cleaning * np.count_nonzero(confidence >= MEMBER) > self._drawing
+            if worth and client.camera is not None and not client.busy:
                 self._send_picture(client, client.camera, confidence)
+            drafted.append(time.perf_counter())
 
         self._select_by(client, request, memory, draft)
         selection = self._pictures.selection
+        if drafted and selection is not None:
+            count = np.count_nonzero(selection >= MEMBER)
+            self._cleaning = (time.perf_counter() - drafted[0]) / max(int(count), 1)
         stages |= {name: round(1e3 * spent, 1) for name, spent in self._session.seconds.items()}
         self._send_selected(client, request, "final", selection, stages=stages, began=began)
 

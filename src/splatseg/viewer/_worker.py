@@ -319,9 +319,15 @@ class Worker:
 
     # In the thread.
 
-    def redraw(self) -> None:
-        """Draw the last camera of every page again, at rest: the document changed."""
+    def redraw(self, author: str = "") -> None:
+        """Draw the last camera of every page again, at rest: the document changed.
+
+        Args:
+            author: The page that changed it; it is drawn for first.
+        """
         with self._changed:
+            order = sorted(self._clients.values(), key=lambda client: client.author != author)
+            self._clients = {client.id: client for client in order}
             for client in self._clients.values():
                 if client.camera is not None and client.waiting_camera is None:
                     client.waiting_camera = _at_rest(client.camera)
