@@ -111,7 +111,9 @@ class Page:
 
     def __init__(self, **arguments: Any) -> None:
         self._stack = ExitStack()
-        self.socket: ClientConnection = self._stack.enter_context(connect(**arguments))
+        self.socket: ClientConnection = self._stack.enter_context(
+            connect(close_timeout=1, **arguments)
+        )
         self.heard: list[Any] = []
         """Everything that came: objects of text messages, bytes of others."""
 

@@ -458,6 +458,18 @@ def test_there_are_so_many_pages_at_a_time(server) -> None:
             page.__exit__()
 
 
+def test_a_page_that_reads_no_more_is_let_go(server, monkeypatch) -> None:
+    monkeypatch.setattr(_server, "_MAX_WAITING", 5)
+    with opened(server), opened(server) as other:
+        before = len(server.worker.clients)
+        for _ in range(40):
+            server.worker.broadcast(messages.Error(text="x" * 1_000_000))
+            other.next("error")
+        while len(server.worker.clients) == before:
+            time.sleep(0.01)
+        assert other.still(1).rest, "who reads stays"
+
+
 def test_jobs_are_so_many_at_a_time(page) -> None:
     given = {"camera": json_camera(), "frames": 1000}
     for id in range(6):

@@ -31,7 +31,7 @@ _MAX_WAITING = 4000
 """Most messages that wait for one page; one that reads no more is let go."""
 
 _MIN_WIDTH, _MAX_WIDTH = 16, 4096
-_GOING_AWAY, _UNSUPPORTED, _POLICY, _TOO_BIG, _LATER = 1001, 1003, 1008, 1009, 1013
+_UNSUPPORTED, _POLICY, _TOO_BIG, _LATER = 1003, 1008, 1009, 1013
 
 
 class ViewServer:
@@ -223,15 +223,15 @@ class ViewServer:
                 await page.say(messages.Error(text=text, fix="close another one"))
                 await websocket.close(_LATER)
                 return
-            sending = asyncio.create_task(page.send_all(client))
-            receiving = asyncio.create_task(page.receive_all(client))
+            work = (page.send_all(client), page.receive_all(client), page.full.wait())
+            tasks = [asyncio.create_task(one) for one in work]
             try:
-                await asyncio.wait((sending, receiving), return_when=asyncio.FIRST_COMPLETED)
+                await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
             finally:
                 self.worker.leave(client)
-                for task in (sending, receiving):
+                for task in tasks:
                     task.cancel()
-                await asyncio.gather(sending, receiving, return_exceptions=True)
+                await asyncio.gather(*tasks, return_exceptions=True)
 
     async def _welcome(self, websocket: Any) -> bool:
         """Whether the first message is a hello of our version, from who has access."""
@@ -270,6 +270,8 @@ class _Page:
         self._loop = asyncio.get_running_loop()
         self._waiting: deque[str | bytes] = deque()
         self._wake = asyncio.Event()
+        self.full = asyncio.Event()
+        """Set when too much waits: the page reads no more."""
         self._refused = guard.Rate(guard.MAX_REFUSED, seconds=60)
         self._cameras = guard.Rate(guard.CAMERAS_A_SECOND)
         self._selections = guard.Rate(guard.SELECTIONS_A_SECOND)
@@ -281,12 +283,15 @@ class _Page:
             self._loop.call_soon_threadsafe(self._put, message)
 
     def _put(self, message: str | bytes) -> None:
+        if len(self._waiting) >= _MAX_WAITING:
+            self.full.set()
+            return
         self._waiting.append(message)
         self._wake.set()
 
     async def send_all(self, client: Client) -> None:
-        """Send what waits, in order, until the page reads no more."""
-        while len(self._waiting) <= _MAX_WAITING:
+        """Send what waits, in order."""
+        while True:
             await self._wake.wait()
             self._wake.clear()
             while self._waiting:
@@ -297,7 +302,6 @@ class _Page:
                 await self._websocket.send_bytes(message)
                 if message[:1] == b"F":
                     self._worker.sent(client)
-        await self._websocket.close(_GOING_AWAY)
 
     async def receive_all(self, client: Client) -> None:
         """Pass on what comes, until the page leaves or sends what no page of ours sends."""
