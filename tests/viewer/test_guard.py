@@ -231,6 +231,13 @@ def test_two_hosts_or_two_cookies_are_none(server) -> None:
     assert status in (400, 421)
 
 
+def test_a_head_that_is_there_twice_is_as_if_missing() -> None:
+    scope = {"headers": [(b"origin", b"a"), (b"cookie", b"x"), (b"origin", b"b")]}
+    assert guard.header(scope, b"origin") is None
+    assert guard.header(scope, b"host") is None
+    assert guard.header(scope, b"cookie") == "x"
+
+
 @pytest.mark.parametrize("method", ["PUT", "DELETE", "PATCH", "OPTIONS", "TRACE"])
 def test_other_methods_are_refused(server, method: str) -> None:
     assert raw(server, "/", method=method, **cookie(server)) == 405

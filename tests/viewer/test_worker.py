@@ -92,7 +92,14 @@ def settled(worker: Worker, noted: Noted) -> list[Any]:
     noted.gate.set()
     ended = threading.Event()
     original = noted.hint
-    noted.hint = lambda client: ended.set()
+
+    def look(client: Client) -> None:
+        if client.id:
+            original(client)
+        else:
+            ended.set()
+
+    noted.hint = look
     # A hint is looked for when there is nothing else.
     for _ in range(500):
         with worker._changed:  # input makes it forgotten
@@ -222,6 +229,14 @@ def test_a_job_waits_for_all_else_and_lets_others_in_between_its_steps(worker, n
     noted.waiting.clear()
     noted.gate.set()
     assert noted.waiting.wait(10)
+    draw = noted.draw
+
+    def draw_and_ask_again(client: Client, request: messages.DrawRequest) -> None:
+        draw(client, request)
+        if request.id < 3:
+            worker.give(client, camera(request.id + 1))
+
+    noted.draw = draw_and_ask_again
     worker.give(client, camera(1))
     worker.give(client, select(2))
     noted.job_gate.set()
@@ -229,6 +244,7 @@ def test_a_job_waits_for_all_else_and_lets_others_in_between_its_steps(worker, n
     assert done[0] == ("select", 1, 1, 0.5)
     assert done.index(("step", 7, 0)) < done.index(("draw", 1, 1)) < done.index(("job", 7))
     assert done.index(("select", 1, 2, 0.5)) < done.index(("job", 7))
+    assert done.index(("draw", 1, 3)) < done.index(("job", 7)), "one at each step at least"
 
 
 def test_a_job_that_is_cancelled_ends_at_its_next_step(worker, noted) -> None:
@@ -325,3 +341,28 @@ def test_an_error_has_no_path_and_says_what_to_do(said: str, text: str, fix: str
         assert error.text == text
     assert "/home" not in error.text
     assert "Users" not in error.text
+
+
+def test_steps_of_what_is_answered_meanwhile_are_not_the_jobs(worker, noted) -> None:
+    said: list[Any] = []
+    client = worker.join(said.append)
+    assert client is not None
+    running: list[Job] = []
+    run = noted.run
+
+    def run_and_remember(job: Job) -> None:
+        running.append(job)
+        run(job)
+
+    noted.run = run_and_remember
+    noted.answer = lambda client, message: running[0].step(99, 100)
+    settled(worker, noted)
+    noted.job_gate.clear()
+    noted.waiting.clear()
+    worker.give(client, messages.JobRequest(id=7, name="export"))
+    assert noted.waiting.wait(10)
+    worker.give(client, select(1))
+    noted.job_gate.set()
+    assert ("job", 7) in settled(worker, noted)
+    assert [one for one in said if '"progress"' in one and '"done":99' in one] == []
+    assert sum('"progress"' in one for one in said) == 3

@@ -233,7 +233,6 @@ class Worker:
             self._clients.pop(client.id, None)
             self._tasks = deque(task for task in self._tasks if task[0] is not client)
             self._hint = None if self._hint is client else self._hint
-            client.waiting_camera = None
             count = len(self._clients)
         self._tell_count(count)
 
