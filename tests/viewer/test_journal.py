@@ -1,6 +1,7 @@
 """The journal: what is done is there again, however the process ended; damage is said."""
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -14,7 +15,7 @@ from splatseg.errors import FileFormatError, InputError, OutputError
 from splatseg.viewer import _journal
 from splatseg.viewer._journal import Journal, command_from_json, masks_of
 from splatseg.viewer._state import Command, Document, History
-from splatseg.viewer.commands import Delete, Edit, Join, Keep, Rename, Select, Suggestion
+from splatseg.viewer.commands import Delete, Edit, Join, Keep, Rename, Select, Subtract, Suggestion
 from support.viewing import COUNT, done, put, steps, stored
 
 
@@ -147,6 +148,35 @@ def test_masks_are_written_before_the_line_that_names_them(tmp_path, monkeypatch
     written.journal.close()
     names = {path.stem for path in (tmp_path / "masks").glob("*.z")}
     assert {mask.id for mask in masks_of(written.history.document)} <= names
+
+
+def test_a_mask_that_a_command_alone_names_is_written(tmp_path) -> None:
+    written = Written(tmp_path)
+    first = [Select(put(written.masks, 1, 2)), Keep("mug")]
+    written.take([*first, Subtract(1, put(written.masks, 2))])
+    written.journal.close()
+    assert reopen(tmp_path) == (written.history.document, ())
+
+
+def test_a_line_lasts_before_it_counts(tmp_path, monkeypatch) -> None:
+    written = Written(tmp_path)
+    mask = put(written.masks, 1)
+    written.masks.persist([mask])
+    lasting: list[bytes] = []
+    monkeypatch.setattr(
+        _journal.os, "fsync", lambda _: lasting.append((tmp_path / "journal.jsonl").read_bytes())
+    )
+    written.do(Select(mask))
+    written.journal.close()
+    assert lasting == [(tmp_path / "journal.jsonl").read_bytes()]
+
+
+def test_what_a_killed_process_was_writing_is_cleared(tmp_path) -> None:
+    left = tmp_path / ".splatseg-999999999-abc"
+    left.mkdir()
+    os.utime(left, (1, 1))
+    reopen(tmp_path)
+    assert not left.exists()
 
 
 def test_what_was_only_tried_leaves_no_file(tmp_path) -> None:

@@ -954,6 +954,7 @@ def test_one_object_becomes_a_file_with_its_edits(folder) -> None:
         keep(session, "1", (rows >= 200) & (rows < 350))
         lift = Edit(kind="move", mask=put(session.masks, *range(100)), translation=(0, 0, 9))
         session.do(Apply(lift))
+        assert session.edited_scene().root is None
         path = session.export("splat", "mug", [1])
         assert path == folder / "exports" / "mug.ply"
         mug = read_splats(path)

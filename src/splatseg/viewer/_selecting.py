@@ -98,7 +98,6 @@ class ColourSource:
             far = self._nearest(self._colours, outside) / alike
             far = far + self._nearest(means, outside) / max(apart, 1e-9)
             candidates &= near < far
-            candidates[outside] = False
         for prompt in prompts:
             if prompt.inside is not None:
                 candidates &= _seen_within(self._gaussians, prompt)
