@@ -1,7 +1,9 @@
 """A real server on a small scene, and pages that speak to it as ours does."""
 
+import io
 import threading
 import time
+import zipfile
 
 import httpx
 import numpy as np
@@ -440,7 +442,16 @@ def test_what_is_exported_can_be_fetched(client, page) -> None:
     page.send("job", id=2, name="export", arguments={"what": "objects", "name": "all"})
     file = finished(page, 2)["result"]["file"]
     assert file == "all.zip"
-    assert client.get(f"/exports/{file}").content.startswith(b"PK")
+    with zipfile.ZipFile(io.BytesIO(client.get(f"/exports/{file}").content)) as archive:
+        assert "all/objects.json" in archive.namelist()
+        assert any(name.endswith(".ply") for name in archive.namelist())
+    given = {"what": "objects", "name": "small", "format": "spz"}
+    page.send("job", id=3, name="export", arguments=given)
+    content = client.get(f"/exports/{finished(page, 3)['result']['file']}").content
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        assert any(name.endswith(".spz") for name in archive.namelist())
+    page.send("job", id=4, name="export", arguments={"what": "splat", "name": "all.spz"})
+    assert finished(page, 4)["result"]["file"] == "all.spz"
 
 
 def test_a_layer_is_saved_and_listed(page, things) -> None:

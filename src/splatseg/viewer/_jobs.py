@@ -270,8 +270,7 @@ class SceneJobs:
         match given:
             case messages.Export():
                 ids = None if given.ids is None else tuple(given.ids)
-                name = given.name if given.format is None else f"{given.name}.{given.format}"
-                path = session.export(given.what, name, ids=ids)
+                path = session.export(given.what, given.name, ids, format=given.format)
                 return (zipped(path) if path.is_dir() else path), "exported"
             case messages.SaveLayer():
                 session.save_layer(given.name)

@@ -16,6 +16,7 @@ from msgspec import Meta
 
 from splatseg.core import Camera
 from splatseg.errors import InputError, brief, reason
+from splatseg.io.splats import WritableFormat
 from splatseg.viewer._outgoing import VERSION as VERSION
 from splatseg.viewer._outgoing import Clients as Clients
 from splatseg.viewer._outgoing import DocumentInfo as DocumentInfo
@@ -381,7 +382,9 @@ class Export(_Incoming, kw_only=True):
 
     what: Literal["splat", "objects", "points", "table", "coco"] = "splat"
     name: FileName
-    format: Literal["ply", "compressed.ply", "splat", "spz", "sog", "glb"] | None = None
+    format: WritableFormat | None = None
+    """Of splats; None goes by the ending of `name`, and is PLY without one."""
+
     ids: Ids | None = None
 
 
