@@ -57,7 +57,9 @@ def write_scene(folder: Path) -> Path:
     )
     photograph = folder.parent / "photographs" / "first.png"
     photograph.parent.mkdir(parents=True, exist_ok=True)
-    write_png(np.full((HEIGHT, WIDTH, 3), (200, 100, 50), dtype=np.uint8), photograph)
+    image = np.full((HEIGHT, WIDTH, 3), (200, 100, 50), dtype=np.uint8)
+    image[26:46, 16:36] = (20, 200, 220)  # where the red ball is
+    write_png(image, photograph)
     view = View(name="first", camera=camera(), image=photograph)
     scene = Scene(gaussians=gaussians, views=(view,), up=(0.0, 0.0, 1.0))
     save_scene(scene, folder)

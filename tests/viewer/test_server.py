@@ -1,6 +1,7 @@
 """A real server on a small scene, and pages that speak to it as ours does."""
 
 import io
+import json
 import threading
 import time
 import zipfile
@@ -12,6 +13,7 @@ from websockets.exceptions import ConnectionClosed
 
 from splatseg.errors import InputError
 from splatseg.io.scene import load_scene
+from splatseg.viewer._job_process import main
 from splatseg.viewer._server import ViewServer
 from support.viewer import (
     BLUE_PIXEL,
@@ -495,14 +497,31 @@ def test_pages_are_answered_while_a_job_goes_on_and_it_can_be_cancelled(page, th
     assert not list((things / "exports").glob("*.mp4"))
 
 
-def test_masks_and_their_layer_are_made_beside_the_drawing(page, things) -> None:
+def test_masks_are_made_beside_the_drawing(page, things) -> None:
     page.send("job", id=1, name="see", arguments={"model": "classical"})
     page.next("progress", id=1)
     assert page.still(1).size == (WIDTH, HEIGHT)
     assert finished(page, 1)["type"] == "finished"
     assert list((things / "evidence" / "masks").glob("first*"))
-    page.send("job", id=2, name="see", arguments={"model": "no-such"})
-    assert "expected one of" in finished(page, 2)["text"]
+    assert any(isinstance(one, dict) and one["type"] == "state" for one in page.heard[1:])
+
+
+def test_the_process_of_a_job_says_how_far_it_is_and_how_it_ends(things) -> None:
+    def said(name: str, **given: str) -> tuple[int, list[dict]]:
+        out = io.StringIO()
+        status = main([name, str(things), "cpu"], io.StringIO(json.dumps(given)), out)
+        return status, [json.loads(line) for line in out.getvalue().splitlines()]
+
+    status, lines = said("see", model="classical")
+    assert status == 0
+    assert all(set(line) == {"done", "total", "text"} for line in lines[:-1])
+    assert (lines[-2]["done"], lines[-2]["total"]) == (1, 1)
+    assert lines[-1] == {"text": "masks of 1 views by classical"}
+    assert said("associate")[1][-1] == {"text": "layer masks"}
+    assert set(load_scene(things).layers) == {"masks", "things"}
+    status, lines = said("see", model="../masks")
+    assert status == 2
+    assert "expected one of" in lines[-1]["error"]
 
 
 def test_an_error_in_an_answer_leaves_the_server_running(page, monkeypatch, caplog) -> None:
