@@ -10,7 +10,7 @@ import pytest
 from splatseg.errors import InputError
 from splatseg.viewer import _guard as guard
 from splatseg.viewer import _messages as messages
-from splatseg.viewer._worker import Client, Job, Worker, error_message
+from splatseg.viewer._worker import Client, Job, Worker
 from support.viewer import json_camera
 
 
@@ -335,7 +335,7 @@ def test_there_is_room_for_so_many(worker) -> None:
     ],
 )  # fmt: skip
 def test_an_error_has_no_path_and_says_what_to_do(said: str, text: str, fix: str) -> None:
-    error = error_message(InputError(said), gesture=4)
+    error = messages.error_message(InputError(said), gesture=4)
     assert (error.fix, error.gesture) == (fix, 4)
     if "a b" not in said:
         assert error.text == text

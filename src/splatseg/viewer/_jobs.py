@@ -30,7 +30,7 @@ from splatseg.viewer import _messages as messages
 from splatseg.viewer._mirror import Mirror
 from splatseg.viewer._pictures import Pictures
 from splatseg.viewer._session import Session
-from splatseg.viewer._worker import Job, Worker, error_message
+from splatseg.viewer._worker import Job, Worker
 
 _FRAMES_A_SECOND = 24.0
 _POLL_SECONDS = 0.2
@@ -200,7 +200,7 @@ def _followed(
     if job.cancelled:
         return messages.Error(text="cancelled", id=job.id)
     if "error" in last:
-        return error_message(InputError(last["error"]), id=job.id)
+        return messages.error_message(InputError(last["error"]), id=job.id)
     if process.returncode or "done" in last or not last:
         text = f"the process of {job.request.name} ended with status {process.returncode}"
         return messages.Error(text=text, id=job.id)

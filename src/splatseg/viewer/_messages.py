@@ -39,6 +39,7 @@ from splatseg.viewer._outgoing import Stage as Stage
 from splatseg.viewer._outgoing import State as State
 from splatseg.viewer._outgoing import SuggestionInfo as SuggestionInfo
 from splatseg.viewer._outgoing import ViewInfo as ViewInfo
+from splatseg.viewer._outgoing import error_message as error_message
 from splatseg.viewer._outgoing import form as form
 from splatseg.viewer._outgoing import frame_bytes as frame_bytes
 from splatseg.viewer._outgoing import id_map_bytes as id_map_bytes

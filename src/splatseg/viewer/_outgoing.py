@@ -3,9 +3,10 @@
 Binary messages are little-endian and begin with one byte of kind.
 """
 
+import re
 import struct
 import zlib
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import msgspec
 import numpy as np
@@ -15,6 +16,8 @@ VERSION = 1
 """Of the protocol. A page of another version is told to load itself again."""
 
 Stage = Literal["draft", "final"]
+
+_PATH = re.compile(r"(?<![\w/.])(?:[A-Za-z]:)?[/\\](?:[^\s/\\:'\"]+[/\\])+")
 
 
 class _Outgoing(msgspec.Struct, kw_only=True):
@@ -239,3 +242,10 @@ def id_map_bytes(camera: int, ids: NDArray[np.uint16]) -> bytes:
     height, width = ids.shape
     values = np.ascontiguousarray(ids, dtype="<u2").tobytes()
     return struct.pack("<cIHH", b"I", camera, width, height) + zlib.compress(values, 1)
+
+
+def error_message(error: BaseException, **about: Any) -> Error:
+    """What a page shows of an error: without paths, and what to do by itself."""
+    text = _PATH.sub("", str(error)).rstrip(".")
+    said, _, fix = text.partition("; ")
+    return Error(text=said, fix=fix, **about)

@@ -21,7 +21,7 @@ from splatseg.io.atomic import path_inside
 from splatseg.render import BackendName
 from splatseg.viewer import _guard as guard
 from splatseg.viewer import _messages as messages
-from splatseg.viewer._worker import Client, Worker, about, error_message
+from splatseg.viewer._worker import Client, Worker, about
 
 STATIC = Path(__file__).parent / "static"
 """The page."""
@@ -329,12 +329,12 @@ class _Page:
         try:
             message = messages.parse(text)
         except InputError as error:
-            return error_message(error)
+            return messages.error_message(error)
         try:
             self._check_rate(message)
             self._worker.give(client, message)
         except InputError as error:
-            return error_message(error, **about(message))
+            return messages.error_message(error, **about(message))
         return None
 
     def _check_rate(self, message: messages.Incoming) -> None:

@@ -7,7 +7,6 @@ forgotten at the next input. While nobody asks, the thread sleeps.
 """
 
 import logging
-import re
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -27,7 +26,6 @@ _MAX_WAITING = 64
 _MAX_JOBS = 4
 """Most jobs of one page, waiting or running."""
 
-_PATH = re.compile(r"(?<![\w/.])(?:[A-Za-z]:)?[/\\](?:[^\s/\\:'\"]+[/\\])+")
 _log = logging.getLogger("splatseg.viewer")
 
 
@@ -376,7 +374,7 @@ class Worker:
         try:
             work()
         except SplatsegError as error:
-            client.send(error_message(error, **about))
+            client.send(messages.error_message(error, **about))
         except Exception:  # noqa: BLE001  (other pages and the next message are not to suffer)
             _log.exception("an answer failed")
             text = "something is wrong in the server, which has written it to its output"
@@ -477,7 +475,7 @@ class Worker:
         except Cancelled:
             self.end_job(job, messages.Error(text="cancelled", id=job.id))
         except SplatsegError as error:
-            self.end_job(job, error_message(error, id=job.id))
+            self.end_job(job, messages.error_message(error, id=job.id))
         except Exception:  # noqa: BLE001  (as above)
             _log.exception("a job failed")
             text = "something is wrong in the server, which has written it to its output"
@@ -506,10 +504,3 @@ def about(message: messages.Incoming) -> dict[str, int | str | None]:
             return {"command": message.name if message.name in messages.COMMANDS else None}
         case _:
             return {}
-
-
-def error_message(error: BaseException, **about: Any) -> messages.Error:
-    """What a page shows of an error: without paths, and what to do by itself."""
-    text = _PATH.sub("", str(error)).rstrip(".")
-    said, _, fix = text.partition("; ")
-    return messages.Error(text=said, fix=fix, **about)
