@@ -100,7 +100,8 @@ export class Camera {
   /** @param {Camera} other */
   copy(other) {
     for (const key of /** @type {const} */ (["right", "down", "forward", "position", "pivot"])) {
-      this[key] = [...other[key]];
+      const [x, y, z] = other[key];
+      this[key] = [x, y, z];
     }
     this.focal = other.focal;
   }

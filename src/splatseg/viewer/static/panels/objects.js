@@ -24,7 +24,7 @@ export class ObjectsPanel {
     this.query = "";
     /** Row that the range of a Shift+click starts at. @type {number|null} */
     this.anchor = null;
-    /** @type {number|null} */
+    /** Object whose row is a text field now: rows are not rebuilt under it. @type {number|null} */
     this.renaming = null;
     const section = byId("objects", HTMLElement);
     this.count = el("span", { class: "count" });
@@ -89,6 +89,7 @@ export class ObjectsPanel {
   }
 
   show() {
+    if (this.renaming !== null) return;
     const { objects } = this.app.store.document;
     const shown = this.shown();
     this.count.textContent = objects.length > 0 ? number(objects.length) : "";
@@ -397,6 +398,7 @@ export class ObjectsPanel {
     const finish = (/** @type {boolean} */ take) => {
       if (done) return;
       done = true;
+      this.renaming = null;
       const name = input.value.trim();
       this.show();
       if (take && name && name !== object.name) this.app.command("rename", { id, name });
@@ -408,6 +410,7 @@ export class ObjectsPanel {
       this.list.box.focus();
     });
     input.addEventListener("blur", () => finish(true));
+    this.renaming = id;
     label.replaceChildren(input);
     input.focus();
     input.select();

@@ -60,6 +60,8 @@ export class Stage {
     this.pivotShown = 0;
     this.drawing = false;
     this.seen = false;
+    /** Whether the canvas has the focus by the pointer: `Tab` is then a key of the view. */
+    this.byPointer = false;
     this.listen();
   }
 
@@ -75,6 +77,7 @@ export class Stage {
     overlay.addEventListener("wheel", (event) => this.wheel(event), { passive: false });
     overlay.addEventListener("focus", () => this.redraw());
     overlay.addEventListener("blur", () => {
+      this.byPointer = false;
       this.flying.clear();
       this.redraw();
     });
@@ -203,6 +206,7 @@ export class Stage {
   /** @param {PointerEvent} event */
   pointerDown(event) {
     this.overlay.focus({ preventScroll: true });
+    this.byPointer = true;
     cancelAnimationFrame(this.swing);
     const point = this.point(event);
     this.overlay.setPointerCapture(event.pointerId);
@@ -456,7 +460,7 @@ export class Stage {
       if (at.depth > 0) ring(g, at.x, at.y, 9, this.app.accent);
     }
     this.tool.draw?.(g, this.ratio);
-    if (document.activeElement === this.overlay && this.overlay.matches(":focus-visible")) {
+    if (document.activeElement === this.overlay && !this.byPointer) {
       const { x, y } = this.middle();
       cross(g, x, y);
     }
