@@ -26,6 +26,9 @@ export const norm = (a) => Math.hypot(a[0], a[1], a[2]);
 /** @param {Vec3} a @returns {Vec3} */
 export const unit = (a) => mul(a, 1 / (norm(a) || 1));
 
+/** @param {Vec3} a @returns {Vec3} */
+const copied = (a) => [a[0], a[1], a[2]];
+
 /** `a` turned about `axis` (unit) by `angle`, Rodrigues. @param {Vec3} a @param {Vec3} axis
  * @param {number} angle @returns {Vec3} */
 export function turn(a, axis, angle) {
@@ -100,8 +103,7 @@ export class Camera {
   /** @param {Camera} other */
   copy(other) {
     for (const key of /** @type {const} */ (["right", "down", "forward", "position", "pivot"])) {
-      const [x, y, z] = other[key];
-      this[key] = [x, y, z];
+      this[key] = copied(other[key]);
     }
     this.focal = other.focal;
   }
@@ -200,7 +202,7 @@ export class Camera {
   frame(centre, radius) {
     const half = Math.min(this.width, this.height) / 2 / this.pixels;
     const distance = Math.max((radius * 1.15) / Math.sin(Math.atan(half)), this.radius * 1e-2);
-    this.pivot = [...centre];
+    this.pivot = copied(centre);
     this.position = sub(centre, mul(this.forward, distance));
   }
 
@@ -210,7 +212,7 @@ export class Camera {
     const right = cross(this.forward, this.up);
     if (norm(right) > 1e-6) this.right = unit(right);
     this.down = cross(this.forward, this.right);
-    this.pivot = [...point];
+    this.pivot = copied(point);
   }
 
   /** @returns {string} For the fragment of a link. */

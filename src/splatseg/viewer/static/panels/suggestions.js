@@ -28,8 +28,10 @@ export class SuggestionsPanel {
       },
       key: (event, item) => this.key(event, item),
     });
-    this.acceptAll = iconButton("check", "Accept all", () => this.all("accept"), { text: true, class: "small" });
-    this.rejectAll = iconButton("close", "Reject all", () => this.all("reject"), { text: true, class: "small" });
+    const button = (/** @type {"accept"|"reject"} */ name, /** @type {string} */ text) =>
+      el("button", { type: "button", class: "button small", text, onclick: () => this.all(name) });
+    this.acceptAll = button("accept", "Accept all");
+    this.rejectAll = button("reject", "Reject all");
     const layers = iconButton("layers", "Suggest from a layer", () => this.layerMenu(layers), { class: "small" });
     this.layers = layers;
     this.offer = el("div", { class: "offer" });

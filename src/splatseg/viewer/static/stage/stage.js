@@ -75,7 +75,10 @@ export class Stage {
     overlay.addEventListener("pointerleave", () => this.leave());
     overlay.addEventListener("contextmenu", (event) => event.preventDefault());
     overlay.addEventListener("wheel", (event) => this.wheel(event), { passive: false });
-    overlay.addEventListener("focus", () => this.redraw());
+    overlay.addEventListener("focus", () => {
+      overlay.toggleAttribute("data-keyboard", !this.byPointer);
+      this.redraw();
+    });
     overlay.addEventListener("blur", () => {
       this.byPointer = false;
       this.flying.clear();
@@ -205,8 +208,9 @@ export class Stage {
 
   /** @param {PointerEvent} event */
   pointerDown(event) {
-    this.overlay.focus({ preventScroll: true });
     this.byPointer = true;
+    this.overlay.focus({ preventScroll: true });
+    delete this.overlay.dataset.keyboard;
     cancelAnimationFrame(this.swing);
     const point = this.point(event);
     this.overlay.setPointerCapture(event.pointerId);
