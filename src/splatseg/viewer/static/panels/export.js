@@ -31,7 +31,7 @@ const KINDS = [
   },
   {
     id: "objects",
-    label: "A file an object",
+    label: "A file per object",
     icon: "similar",
     about: "A folder with one splat file for each object, and a table.",
     formats: SPLATS,
@@ -41,7 +41,7 @@ const KINDS = [
   {
     id: "points",
     label: "Point cloud",
-    icon: "grow",
+    icon: "points",
     about: "Middles of the Gaussians with colour and labels.",
     formats: [
       ["ply", "PLY"],
@@ -54,7 +54,7 @@ const KINDS = [
   {
     id: "table",
     label: "Table",
-    icon: "panel",
+    icon: "table",
     about: "Objects with class, box, volume and confidence.",
     formats: [
       ["csv", "CSV"],
@@ -130,6 +130,7 @@ export class ExportDialog {
           id,
           class: "unseen",
           checked: item === kind,
+          autofocus: item === kind,
           onchange: () => {
             this.kind = item;
             this.build();

@@ -4,7 +4,7 @@ import { el, icon } from "../dom.js";
 
 /**
  * @typedef {{label: string, icon?: string, action?: () => void, disabled?: boolean,
- *   checked?: boolean, key?: string}|"line"|{title: string}} Item
+ *   checked?: boolean, key?: string, toggle?: boolean}|"line"|{title: string}} Item
  */
 
 /**
@@ -31,7 +31,7 @@ export function openMenu(button, items) {
       {
         type: "button",
         class: "menu-item",
-        role: checks ? "menuitemradio" : "menuitem",
+        role: checks ? (item.toggle ? "menuitemcheckbox" : "menuitemradio") : "menuitem",
         "aria-checked": checks ? String(item.checked) : null,
         tabindex: -1,
         disabled: item.disabled,
@@ -69,7 +69,7 @@ export function openMenu(button, items) {
     menu.remove();
     if (inside) button.focus();
   });
-  document.body.append(menu);
+  (button.closest("header, nav, main, aside") ?? document.body).append(menu);
   button.setAttribute("aria-haspopup", "menu");
   button.setAttribute("aria-expanded", "true");
   menu.showPopover();

@@ -266,7 +266,7 @@ export class ObjectsPanel {
       form.remove();
       button.focus();
     });
-    document.body.append(form);
+    this.actions.append(form);
     form.showPopover();
     const at = button.getBoundingClientRect();
     form.style.left = `${Math.max(8, Math.min(at.left, innerWidth - form.offsetWidth - 8))}px`;
@@ -394,6 +394,8 @@ export class ObjectsPanel {
       autocomplete: "off",
       spellcheck: "false",
     });
+    const active = document.activeElement;
+    const before = active === this.app.stage.overlay ? this.app.stage.overlay : this.list.box;
     let done = false;
     const finish = (/** @type {boolean} */ take) => {
       if (done) return;
@@ -407,7 +409,7 @@ export class ObjectsPanel {
       event.stopPropagation();
       if (event.key !== "Enter" && event.key !== "Escape") return;
       finish(event.key === "Enter");
-      this.list.box.focus();
+      before.focus();
     });
     input.addEventListener("blur", () => finish(true));
     this.renaming = id;

@@ -198,6 +198,7 @@ export class TopBar {
       {
         label: "Keys of one letter",
         checked: app.keys.letters,
+        toggle: true,
         action: () => app.keys.setLetters(!app.keys.letters),
       },
     ]);

@@ -457,7 +457,8 @@ export class Stage {
     g.lineCap = "round";
     if (this.ids && store.hover) this.drawOutline(g, store.hover);
     g.setTransform(pixels, 0, 0, pixels, 0, 0);
-    if (this.pivotShown > performance.now() || this.drag?.moved === true) this.drawPivot(g);
+    const turning = this.drag?.moved === true && !this.drag.tool;
+    if (turning || this.pivotShown > performance.now()) this.drawPivot(g);
     const hint = store.hint;
     if (hint?.point && store.tool === "click") {
       const at = this.css(hint.point);
