@@ -38,7 +38,6 @@ import { Words } from "./tools/words.js";
 
 const HINT_AFTER = 1200;
 const REMEMBER_AFTER = 400;
-const MOST_SELECTED = 60;
 
 export class App {
   constructor() {
@@ -82,6 +81,8 @@ export class App {
     /** Commands of ours that are not answered yet. */
     this.waiting = 0;
     this.keeping = false;
+    /** Whether the selection that a double click began is taken back when it comes. */
+    this.reverting = false;
     this.hintTimer = 0;
     this.rememberTimer = 0;
     /** Camera of the link that opened the page. @type {string|null} */
@@ -129,6 +130,7 @@ export class App {
       this.jobs.forget();
       this.depths.clear();
       this.waiting = 0;
+      this.reverting = false;
     }
     store.connection = status;
     store.changed("connection");
@@ -162,7 +164,7 @@ export class App {
         store.changed("status");
         break;
       case "hint":
-        store.hint = message.point || message.view ? /** @type {any} */ (message) : null;
+        store.hint = message.view != null ? /** @type {any} */ (message) : null;
         store.changed("hint");
         break;
       case "progress":
@@ -180,8 +182,8 @@ export class App {
 
   /** @param {import("./state.js").StateMessage} message */
   take(message) {
-    const { scene } = message;
     this.store.replace(message);
+    const scene = /** @type {import("./state.js").SceneInfo} */ (this.store.scene);
     this.camera.radius = scene.radius || 1;
     if (!this.started) {
       this.started = true;
@@ -199,9 +201,7 @@ export class App {
     const { scene } = this.store;
     if (!scene) return;
     const { matrix, focal, width, height } = scene.home;
-    const size = Math.max(width ?? 0, height ?? 0);
-    const share = focal > 10 && size > 0 ? focal / size : focal;
-    this.camera.focal = clamp(share, 0.2, 5);
+    this.camera.focal = clamp(focal / Math.max(width, height), 0.2, 5);
     const ahead = dot(sub(scene.centre, [matrix[3], matrix[7], matrix[11]]), [
       matrix[2],
       matrix[6],
@@ -219,6 +219,10 @@ export class App {
     }
     if (String(message.author) !== this.store.me) return;
     this.waiting = Math.max(0, this.waiting - 1);
+    if (this.reverting && this.gestures.pending === 0) {
+      this.reverting = false;
+      this.undo();
+    }
     if (!this.keeping) return;
     const fresh = (message.objects ?? []).filter((object) => !before.has(object.id));
     if (fresh.length === 0) return;
@@ -247,7 +251,10 @@ export class App {
     if (gesture != null) {
       const depth = this.depths.get(gesture);
       this.depths.delete(gesture);
-      if (!depth) this.gestures.failed(gesture);
+      if (!depth) {
+        this.reverting = false;
+        this.gestures.failed(gesture);
+      }
     }
     this.toast(String(text), fix ?? "");
   }
@@ -276,6 +283,13 @@ export class App {
     if (sent) this.waiting += 1;
     else this.toast("There is no connection to the server.", "It comes back by itself; then try again.");
     return sent;
+  }
+
+  /** The first click of two selected something, but the pivot was meant. @param {number} gesture */
+  revert(gesture) {
+    if (gesture !== this.gestures.count) return;
+    if (this.gestures.pending === gesture) this.reverting = true;
+    else if (gesture === this.gestures.done) this.undo();
   }
 
   undo() {
@@ -349,6 +363,11 @@ export class App {
     this.stage.redraw();
   }
 
+  /** The mask that a layer has becomes the selection. @param {string} layer */
+  selectLayer(layer) {
+    this.gestures.begin({ kind: "layer", text: layer }, { mode: this.store.selectMode });
+  }
+
   /** all, none, invert, grow, shrink, fill, similar. @param {string} kind */
   selectKind(kind) {
     const needs = ["grow", "shrink", "fill", "similar", "none"].includes(kind);
@@ -363,13 +382,7 @@ export class App {
       if (this.store.document.selection) this.selectKind("none");
       return;
     }
-    if (ids.length > 1 && this.store.features.has("select_object_ids")) {
-      this.command("select_object", { ids, mode: "set" });
-      return;
-    }
-    for (const [index, id] of ids.slice(0, MOST_SELECTED).entries()) {
-      if (!this.command("select_object", { id, mode: index === 0 ? "set" : "add" })) return;
-    }
+    this.command("select_object", { ids, mode: "set" });
   }
 
   /** @param {string} name "" for the next free one. */
@@ -418,8 +431,9 @@ export class App {
   }
 
   showAll() {
-    const hidden = this.store.document.objects.filter((object) => !object.visible);
-    const ids = hidden.map((object) => object.id);
+    const { objects, isolated } = this.store.document;
+    if (isolated?.length) this.command("isolate", { ids: [] });
+    const ids = objects.filter((object) => !object.visible).map((object) => object.id);
     if (ids.length > 0) this.command("set_visible", { ids, visible: true });
   }
 

@@ -11,18 +11,21 @@
  * @typedef {{count: number, confidence: number, centre?: Vec3|null, radius?: number}} SelectionInfo
  * @typedef {{kind: string, count: number}} EditInfo
  * @typedef {{revision: number, objects: SceneObject[], selection: SelectionInfo|null,
- *   suggestions: Suggestion[], edits: EditInfo[]}} Document
+ *   suggestions: Suggestion[], edits: EditInfo[], isolated?: number[]}} Document
  * @typedef {{name: string, matrix: number[], width: number, height: number, fx: number, fy: number,
  *   cx: number, cy: number, split: string, photograph: boolean}} SceneView
  * @typedef {{name: string, count: number, up: Vec3|null, centre: Vec3, radius: number,
- *   home: {matrix: number[], focal: number, width?: number, height?: number}, views: SceneView[],
- *   layers: string[], source: string|null, words: boolean, modes: string[]}} SceneInfo
- * @typedef {{type: "state", version: number, scene: SceneInfo, document: Document,
+ *   home: {matrix: number[], focal: number, width: number, height: number}}} SceneFacts
+ * @typedef {SceneFacts & {views: SceneView[], layers: string[], source: string|null,
+ *   words: boolean, modes: string[]}} SceneInfo
+ * @typedef {{type: "state", version: number, scene: SceneFacts, views: SceneView[],
+ *   layers: string[], source: string|null, words: boolean, modes: string[], document: Document,
  *   undo: string|null, redo: string|null, clients: number, me: string|number, ready?: boolean,
  *   fitting?: {steps: number, progress: number}|null, features?: string[]}} StateMessage
  * @typedef {{type: "patch", from: number, to: number, objects?: SceneObject[]|null,
  *   gone?: number[]|null, order?: number[]|null, suggestions?: Suggestion[]|null,
- *   selection?: SelectionInfo|null, edits?: EditInfo[]|null, undo: string|null,
+ *   selection?: SelectionInfo|null, edits?: EditInfo[]|null, isolated?: number[]|null,
+ *   undo: string|null,
  *   redo: string|null, author: string|number}} PatchMessage
  * @typedef {"click"|"box"|"stroke"|"lasso"|"polygon"|"sphere"|"move"} ToolId
  * @typedef {"set"|"add"|"remove"|"intersect"} SelectMode
@@ -75,7 +78,8 @@ export class Store {
     /** @type {{stage: string, count: number, confidence: number, milliseconds: number,
      *   stages: Record<string, number>}|null} */
     this.selected = null;
-    /** @type {{x: number, y: number, view: string|null, point: Vec3|null, text: string}|null} */
+    /** Where the next click would help most: a pixel of a view. @type {{x: number, y: number,
+     *   view: string|null}|null} */
     this.hint = null;
     /** @type {{width: number, height: number, draw: number, encode: number, whole: number,
      *   scale: number}|null} */
@@ -117,7 +121,8 @@ export class Store {
    * @param {StateMessage} message
    */
   replace(message) {
-    this.scene = message.scene;
+    const { scene, views, layers, source, words, modes } = message;
+    this.scene = { ...scene, views, layers, source, words, modes };
     this.undo = message.undo;
     this.redo = message.redo;
     this.clients = message.clients;
@@ -161,6 +166,7 @@ export class Store {
       selection,
       suggestions: patch.suggestions ?? old.suggestions,
       edits: patch.edits ?? old.edits,
+      isolated: patch.isolated ?? old.isolated,
     });
     this.changed("document", "selection", "picked", "status");
     return true;
@@ -179,6 +185,13 @@ export class Store {
     if (!suggestions.some((item) => item.id === this.suggestion)) {
       this.suggestion = suggestions[0]?.id ?? null;
     }
+  }
+
+  /** Whether an object is shown: not hidden, and among the isolated ones if there are any.
+   * @param {SceneObject} object @returns {boolean} */
+  shows(object) {
+    const { isolated } = this.document;
+    return object.visible && (!isolated?.length || isolated.includes(object.id));
   }
 
   /** The picked objects, in the order of the list. @returns {SceneObject[]} */

@@ -8,13 +8,15 @@ import { byId, el, icon, iconButton } from "../dom.js";
  *   file: string, some?: boolean}} Kind
  */
 
+/** What files may be called. */
+const NAME = "[A-Za-z0-9][A-Za-z0-9._\\-]{0,59}";
+
 /** @type {[string, string][]} */
 const SPLATS = [
   ["ply", "PLY, exact, with labels as columns"],
   ["compressed.ply", "Compressed PLY"],
   ["splat", ".splat"],
   ["spz", "SPZ"],
-  ["spz3", "SPZ version 3"],
   ["sog", "SOG"],
 ];
 
@@ -34,7 +36,6 @@ const KINDS = [
     label: "A file per object",
     icon: "similar",
     about: "A folder with one splat file for each object, and a table.",
-    formats: SPLATS,
     file: "objects",
     some: true,
   },
@@ -155,8 +156,8 @@ export class ExportDialog {
           id: "export-name",
           maxlength: 80,
           required: true,
-          pattern: "[^\\/\\\\]+",
-          title: "A name without / or \\",
+          pattern: this.kind.id === "save_layer" ? null : NAME,
+          title: "Letters, digits, - _ and ., beginning with a letter or a digit",
           value: this.defaultName(),
           autocomplete: "off",
           spellcheck: "false",
@@ -226,8 +227,9 @@ export class ExportDialog {
     const { store } = this.app;
     const scene = store.scene?.name ?? "scene";
     const one = store.picked.size === 1 ? store.pickedObjects()[0].name : null;
-    if (this.kind.id === "splat") return (one ?? scene).replaceAll(/[/\\]/g, "-");
-    return this.kind.file;
+    if (this.kind.id !== "splat") return this.kind.file;
+    const plain = (one ?? scene).normalize("NFKD").replaceAll(/[^A-Za-z0-9._-]+/g, "-");
+    return plain.replace(/^[-._]+|[-._]+$/g, "").slice(0, 60) || "scene";
   }
 
   /** @param {HTMLFormElement} form */
@@ -242,14 +244,14 @@ export class ExportDialog {
     if (kind.id === "save_layer") {
       app.jobs.start("save_layer", { name }, label);
     } else if (kind.id === "picture") {
-      app.jobs.start("picture", { camera: app.camera.record(), name }, label);
+      app.jobs.start("picture", { camera: app.camera.record(), mode: app.store.mode, name }, label);
     } else if (kind.id === "film") {
       const frames = Number(value("export-frames"));
-      app.jobs.start("film", { camera: app.camera.record(), frames, name }, label);
+      const args = { camera: app.camera.record(), mode: app.store.mode, frames, name };
+      app.jobs.start("film", args, label);
     } else {
       /** @type {Record<string, unknown>} */
-      const args = { what: kind.id, name };
-      if (kind.formats) args.format = this.format;
+      const args = { what: kind.id, name: kind.formats ? `${name}.${this.format}` : name };
       if (value("export-which") === "picked") args.ids = [...app.store.picked];
       app.jobs.start("export", args, label);
     }

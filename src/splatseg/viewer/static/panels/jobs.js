@@ -64,7 +64,7 @@ export class JobsPanel {
     const job = this.remove(id);
     if (!job) return;
     const file = result?.file;
-    const text = result?.text || `${job.label}: done.`;
+    const text = result?.text ? `${job.label}: ${result.text}.` : `${job.label}: done.`;
     if (file) void this.offer(String(file), text);
     else this.app.toasts.show(text, "", { good: true });
     job.done?.(result);

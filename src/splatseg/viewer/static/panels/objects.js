@@ -105,7 +105,7 @@ export class ObjectsPanel {
     } else {
       this.empty.append(el("p", { text: "No object has that name or class." }));
     }
-    this.showAll.hidden = objects.every((object) => object.visible);
+    this.showAll.hidden = objects.every((object) => this.app.store.shows(object));
     this.showPicked();
   }
 
@@ -319,7 +319,7 @@ export class ObjectsPanel {
       el("span", { class: "cell", role: "gridcell" }, eye),
       el("span", { class: "cell", role: "gridcell" }, lock),
     );
-    row.toggleAttribute("data-hidden", !object.visible);
+    row.toggleAttribute("data-hidden", !app.store.shows(object));
     row.toggleAttribute("data-locked", object.locked);
     row.addEventListener("click", (event) => {
       if (event.target instanceof Element && event.target.closest("button, input")) return;

@@ -110,6 +110,7 @@ export class SelectionBar {
   menu(button) {
     const { app } = this;
     const any = app.store.document.selection !== null;
+    const layers = app.store.features.has("layer") ? (app.store.scene?.layers ?? []) : [];
     openMenu(button, [
       { label: "Duplicate", icon: "duplicate", disabled: !any, action: () => app.edit("duplicate") },
       { label: "Recolour…", icon: "colour", disabled: !any, action: () => this.colour.showPicker() },
@@ -124,6 +125,12 @@ export class SelectionBar {
         disabled: !any,
         action: () => app.selectKind("none"),
       },
+      ...(layers.length > 0 ? [{ title: "Select what a layer holds" }] : []),
+      ...layers.map((layer) => ({
+        label: layer,
+        icon: "layers",
+        action: () => app.selectLayer(layer),
+      })),
     ]);
   }
 
@@ -146,8 +153,7 @@ export class SelectionBar {
       }
     }
     const { hint } = store;
-    const elsewhere = hint?.view != null && hint.view !== "";
-    this.hintButton.hidden = !hint || !elsewhere;
-    this.hintButton.title = hint?.text || (elsewhere ? `A click in ${hint?.view} would help most` : "");
+    this.hintButton.hidden = !hint?.view;
+    this.hintButton.title = hint?.view ? `A click in ${hint.view} would help most` : "";
   }
 }

@@ -124,6 +124,7 @@ export class SuggestionsPanel {
     row.addEventListener("click", (event) => {
       if (event.target instanceof Element && event.target.closest("button")) return;
       this.list.activate(item.id);
+      this.select(item);
     });
     row.addEventListener("pointerenter", () => app.stage.setHover(SUGGESTION + item.id));
     row.addEventListener("pointerleave", () => app.stage.setHover(0));
@@ -133,9 +134,17 @@ export class SuggestionsPanel {
   /** @param {KeyboardEvent} event @param {Suggestion} item @returns {boolean} */
   key(event, item) {
     if (event.key === "Enter" || event.key === "y") this.decide("accept", item.id);
+    else if (event.key === " ") this.select(item);
     else if (event.key === "Delete" || event.key === "x") this.decide("reject", item.id);
     else return false;
     return true;
+  }
+
+  /** Its Gaussians become the selection, to be looked at. @param {Suggestion} item */
+  select(item) {
+    if (!this.app.store.features.has("select_suggestion")) return;
+    this.app.gestures.forget();
+    this.app.command("select_suggestion", { id: item.id, mode: "set" });
   }
 
   /** The next or the one before; its outline shows. @param {number} step */

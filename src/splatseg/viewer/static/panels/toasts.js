@@ -36,7 +36,7 @@ export class Toasts {
     );
     this.box.append(toast);
     while (this.box.children.length > MOST) this.box.firstElementChild?.remove();
-    let timer = setTimeout(() => toast.remove(), links.length > 0 ? 4 * STAYS : STAYS);
+    let timer = setTimeout(() => toast.remove(), links.length > 0 ? 4 * STAYS : good ? STAYS / 2 : STAYS);
     toast.addEventListener("pointerenter", () => clearTimeout(timer));
     toast.addEventListener("focusin", () => clearTimeout(timer));
     toast.addEventListener("pointerleave", () => {

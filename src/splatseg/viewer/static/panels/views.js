@@ -124,13 +124,18 @@ export class ViewsPanel {
     );
   }
 
+  /** View at whose place the camera stands. @returns {string|null} */
+  here() {
+    return this.app.camera.matrix().join() === this.pose ? this.current : null;
+  }
+
   toggleCompare() {
     const { stage, store } = this.app;
     if (store.photograph !== null) {
       stage.photograph.hide();
       return;
     }
-    const here = this.app.camera.matrix().join() === this.pose ? this.current : null;
+    const here = this.here();
     const view = here === null ? this.nearest() : store.view(here);
     if (!view) return;
     if (!view.photograph) {

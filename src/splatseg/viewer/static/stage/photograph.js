@@ -111,6 +111,16 @@ export class Photograph {
     return this.view !== null && point.x < this.stage.box.clientWidth * this.share;
   }
 
+  /** Where a pixel of a view is on the canvas, if the camera is that of the view.
+   * @param {string} name @param {{x: number, y: number}} pixel @returns {{x: number, y: number}|null} */
+  css(name, { x, y }) {
+    const view = this.app.store.view(name);
+    if (!view) return null;
+    const scale = this.app.camera.pixels / view.fx / this.stage.ratio;
+    const { clientWidth: width, clientHeight: height } = this.stage.box;
+    return { x: width / 2 + (x - view.cx) * scale, y: height / 2 + (y - view.cy) * scale };
+  }
+
   /** Pixel of the photograph. @param {{x: number, y: number}} point @returns {[number, number]} */
   pixel(point) {
     const { width, height } = /** @type {SceneView} */ (this.view);

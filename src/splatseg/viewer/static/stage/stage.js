@@ -51,7 +51,7 @@ export class Stage {
     /** @type {{id: number, button: number, x: number, y: number, lastX: number, lastY: number,
      *   moved: boolean, tool: boolean}|null} */
     this.drag = null;
-    this.lastTap = { time: 0, x: 0, y: 0 };
+    this.lastTap = { time: 0, x: 0, y: 0, gesture: 0 };
     /** @type {Set<string>} Keys of flying that are down. */
     this.flying = new Set();
     this.flySpeed = 1;
@@ -297,11 +297,15 @@ export class Stage {
     const near = Math.hypot(point.x - this.lastTap.x, point.y - this.lastTap.y) < 6;
     if (near && now - this.lastTap.time < 350) {
       this.lastTap.time = 0;
+      if (this.lastTap.gesture) this.app.revert(this.lastTap.gesture);
       this.setPivot(point);
       return;
     }
-    this.lastTap = { time: now, x: point.x, y: point.y };
+    const { gestures } = this.app;
+    const before = gestures.count;
     this.tool.click?.(point);
+    const gesture = gestures.count > before ? gestures.count : 0;
+    this.lastTap = { time: now, x: point.x, y: point.y, gesture };
   }
 
   /** @param {Point} point */
@@ -459,10 +463,10 @@ export class Stage {
     g.setTransform(pixels, 0, 0, pixels, 0, 0);
     const turning = this.drag?.moved === true && !this.drag.tool;
     if (turning || this.pivotShown > performance.now()) this.drawPivot(g);
-    const hint = store.hint;
-    if (hint?.point && store.tool === "click") {
-      const at = this.css(hint.point);
-      if (at.depth > 0) ring(g, at.x, at.y, 9, this.app.accent);
+    const { hint } = store;
+    if (hint?.view && store.tool === "click" && this.app.views.here() === hint.view) {
+      const at = this.photograph.css(hint.view, hint);
+      if (at) ring(g, at.x, at.y, 9, this.app.accent);
     }
     this.tool.draw?.(g, this.ratio);
     if (document.activeElement === this.overlay && !this.byPointer) {

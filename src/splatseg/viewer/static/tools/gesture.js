@@ -18,6 +18,8 @@ export class Gestures {
     this.current = null;
     /** Gesture whose final answer is awaited (0: none). */
     this.pending = 0;
+    /** Gesture that was answered last. */
+    this.done = 0;
     this.levelTimer = 0;
   }
 
@@ -73,7 +75,9 @@ export class Gestures {
 
   /** @param {{gesture: number, stage: string}} answer */
   answered(answer) {
-    if (answer.stage === "final" && answer.gesture >= this.pending) this.pending = 0;
+    if (answer.stage !== "final") return;
+    this.done = answer.gesture;
+    if (answer.gesture >= this.pending) this.pending = 0;
   }
 
   /** @param {number} gesture */
