@@ -159,7 +159,10 @@ export class Store {
     this.undo = patch.undo;
     this.redo = patch.redo;
     const selection = patch.selection === undefined ? old.selection : patch.selection;
-    if (selection === null) this.selected = null;
+    if (selection === null) {
+      this.selected = null;
+      this.hint = null;
+    }
     this.setDocument({
       revision: patch.to,
       objects,
@@ -168,7 +171,7 @@ export class Store {
       edits: patch.edits ?? old.edits,
       isolated: patch.isolated ?? old.isolated,
     });
-    this.changed("document", "selection", "picked", "status");
+    this.changed("document", "selection", "picked", "status", "hint");
     return true;
   }
 

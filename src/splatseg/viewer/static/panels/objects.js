@@ -395,7 +395,8 @@ export class ObjectsPanel {
       spellcheck: "false",
     });
     const active = document.activeElement;
-    const before = active === this.app.stage.overlay ? this.app.stage.overlay : this.list.box;
+    const { stage } = this.app;
+    const before = active === stage.overlay ? stage : this.list.box;
     let done = false;
     const finish = (/** @type {boolean} */ take) => {
       if (done) return;

@@ -46,10 +46,10 @@ export class SelectionBar {
     this.form.addEventListener("submit", (event) => {
       event.preventDefault();
       this.keep();
-      app.stage.overlay.focus();
+      app.stage.focus();
     });
     this.name.addEventListener("keydown", (event) => {
-      if (event.key === "Escape") app.stage.overlay.focus();
+      if (event.key === "Escape") app.stage.focus();
     });
     const shape = (/** @type {string} */ name, /** @type {string} */ label, /** @type {string} */ kind) =>
       iconButton(name, label, () => app.selectKind(kind));
@@ -61,13 +61,14 @@ export class SelectionBar {
       shape("fill", "Fill holes", "fill"),
       shape("similar", "More like this", "similar"),
     );
+    this.remove = iconButton("trash", "Remove from the scene", () => app.edit("remove"), { key: "Del" });
     const more = iconButton("more", "More for the selection", () => this.menu(more));
     this.colour = el("input", { type: "color", class: "unseen", tabindex: -1, "aria-hidden": "true" });
     this.colour.addEventListener("change", () => app.recolour(this.colour.value));
     this.edits = el(
       "div",
       { class: "group", role: "group", "aria-label": "Edit the selection" },
-      iconButton("trash", "Remove from the scene", () => app.edit("remove"), { key: "Del" }),
+      this.remove,
       more,
       this.colour,
     );
@@ -92,7 +93,7 @@ export class SelectionBar {
       this.form,
       this.hintButton,
     );
-    app.store.on(["selection", "level", "hint", "connection"], () => this.show());
+    app.store.on(["selection", "picked", "level", "hint", "connection"], () => this.show());
     this.show();
   }
 
@@ -147,11 +148,8 @@ export class SelectionBar {
     this.sure.hidden = !shown;
     this.level.value = String(store.level);
     this.level.setAttribute("aria-valuetext", `${percent(store.level)} of the way to the group`);
-    for (const group of [this.shapes, this.edits]) {
-      for (const button of group.querySelectorAll("button")) {
-        button.disabled = !selection && button.getAttribute("aria-label") !== "More for the selection";
-      }
-    }
+    for (const button of this.shapes.querySelectorAll("button")) button.disabled = !selection;
+    this.remove.disabled = !selection && store.picked.size === 0;
     const { hint } = store;
     this.hintButton.hidden = !hint?.view;
     this.hintButton.title = hint?.view ? `A click in ${hint.view} would help most` : "";

@@ -62,6 +62,7 @@ export class Stage {
     this.seen = false;
     /** Whether the canvas has the focus by the pointer: `Tab` is then a key of the view. */
     this.byPointer = false;
+    this.wasByPointer = false;
     this.listen();
   }
 
@@ -80,6 +81,7 @@ export class Stage {
       this.redraw();
     });
     overlay.addEventListener("blur", () => {
+      this.wasByPointer = this.byPointer;
       this.byPointer = false;
       this.flying.clear();
       this.redraw();
@@ -88,6 +90,12 @@ export class Stage {
       overlay.dataset.cursor = this.tool.cursor;
       this.redraw();
     });
+  }
+
+  /** Back to the canvas, as one was there before. */
+  focus() {
+    this.byPointer = this.wasByPointer;
+    this.overlay.focus({ preventScroll: true });
   }
 
   /** @returns {Tool} */

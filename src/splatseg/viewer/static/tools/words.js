@@ -16,7 +16,7 @@ export class Words {
     });
     this.field.addEventListener("keydown", (event) => {
       if (event.key === "Escape") {
-        app.stage.overlay.focus();
+        app.stage.focus();
         event.stopPropagation();
       }
       if (event.key === "Enter" && (event.shiftKey || event.ctrlKey)) {
@@ -34,7 +34,7 @@ export class Words {
     if (!text || this.field.disabled) return;
     const { gestures } = this.app;
     gestures.begin({ kind: "words", text }, { mode: gestures.modeOf(keys) });
-    this.app.stage.overlay.focus();
+    this.app.stage.focus();
   }
 
   show() {
