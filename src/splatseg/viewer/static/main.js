@@ -219,10 +219,6 @@ export class App {
     }
     if (String(message.author) !== this.store.me) return;
     this.waiting = Math.max(0, this.waiting - 1);
-    if (this.reverting && this.gestures.pending === 0) {
-      this.reverting = false;
-      this.undo();
-    }
     if (!this.keeping) return;
     const fresh = (message.objects ?? []).filter((object) => !before.has(object.id));
     if (fresh.length === 0) return;
@@ -237,6 +233,10 @@ export class App {
     this.store.selected = { ...message, stages: message.stages ?? {} };
     this.store.changed("selection", "status");
     if (message.stage !== "final") return;
+    if (this.reverting) {
+      this.reverting = false;
+      this.undo();
+    }
     clearTimeout(this.hintTimer);
     this.hintTimer = setTimeout(() => {
       if (this.store.document.selection && this.gestures.pending === 0) this.send({ type: "hint" });

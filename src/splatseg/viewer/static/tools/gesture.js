@@ -83,6 +83,7 @@ export class Gestures {
   /** @param {number} gesture */
   failed(gesture) {
     if (gesture === this.pending) this.pending = 0;
+    if (this.app.store.selected?.stage === "draft") this.app.store.selected = null;
     this.app.store.changed("selection");
   }
 
