@@ -77,9 +77,7 @@ export class Camera {
   /** @returns {number[]} world_from_camera, row-major. */
   matrix() {
     const { right: r, down: d, forward: f, position: p } = this;
-    return [
-      r[0], d[0], f[0], p[0], r[1], d[1], f[1], p[1], r[2], d[2], f[2], p[2], 0, 0, 0, 1,
-    ];
+    return [r[0], d[0], f[0], p[0], r[1], d[1], f[1], p[1], r[2], d[2], f[2], p[2], 0, 0, 0, 1];
   }
 
   /** @returns {CameraRecord} What messages hold. */

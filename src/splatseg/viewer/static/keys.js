@@ -5,7 +5,7 @@
  * (WCAG 2.1.4).
  *
  * @typedef {import("./main.js").App} App
- * @typedef {{key: string, ctrl?: boolean, shift?: boolean, shown: string, label: string,
+ * @typedef {{key: string, ctrl: boolean, shift: boolean, shown: string, label: string,
  *   group: string, run: (app: App, event: KeyboardEvent) => void|boolean}} Key
  *   `key`: of `KeyboardEvent.key`, lower case; `run` returns false if it did nothing.
  */
@@ -15,55 +15,80 @@ const ORGANISE = "Objects";
 const EDIT = "Edit";
 const LOOK = "Look";
 
+/**
+ * @param {string} keys `ctrl+shift+z`; `plus` is the key +.
+ * @param {string} shown Keys as `?` shows them, apart by spaces; "" does not show them.
+ * @param {string} label
+ * @param {string} group
+ * @param {Key["run"]} run
+ * @returns {Key}
+ */
+function row(keys, shown, label, group, run) {
+  const parts = keys.split("+");
+  const last = parts.at(-1) ?? "";
+  const key = last === "plus" ? "+" : last;
+  return {
+    key,
+    ctrl: parts.includes("ctrl"),
+    shift: parts.includes("shift"),
+    shown,
+    label,
+    group,
+    run,
+  };
+}
+
 /** @type {readonly Key[]} */
 export const KEYS = [
-  { key: "c", shown: "C", label: "Click", group: SELECT, run: (app) => app.setTool("click") },
-  { key: "r", shown: "R", label: "Box", group: SELECT, run: (app) => app.setTool("box") },
-  { key: "b", shown: "B", label: "Stroke", group: SELECT, run: (app) => app.setTool("stroke") },
-  { key: "l", shown: "L", label: "Lasso", group: SELECT, run: (app) => app.setTool("lasso") },
-  { key: "p", shown: "P", label: "Polygon", group: SELECT, run: (app) => app.setTool("polygon") },
-  { key: "o", shown: "O", label: "Sphere", group: SELECT, run: (app) => app.setTool("sphere") },
-  { key: "[", shown: "[ ]", label: "Smaller, larger brush", group: SELECT, run: (app) => app.size(1 / 1.2) },
-  { key: "]", shown: "", label: "", group: SELECT, run: (app) => app.size(1.2) },
-  { key: ",", shown: ", .", label: "Level: towards part, group", group: SELECT, run: (app) => app.setLevel(app.store.level - 0.1) },
-  { key: ".", shown: "", label: "", group: SELECT, run: (app) => app.setLevel(app.store.level + 0.1) },
-  { key: " ", shown: "Space", label: "Select what is in the middle", group: SELECT, run: (app, event) => app.aim(event) },
-  { key: " ", shift: true, shown: "", label: "", group: SELECT, run: (app, event) => app.aim(event) },
-  { key: " ", ctrl: true, shown: "", label: "", group: SELECT, run: (app, event) => app.aim(event) },
-  { key: "/", shown: "/", label: "Find by words", group: SELECT, run: (app) => app.words.field.focus() },
-  { key: "a", ctrl: true, shown: "Ctrl+A", label: "Select all", group: SELECT, run: (app) => app.selectKind("all") },
-  { key: "a", ctrl: true, shift: true, shown: "Ctrl+Shift+A", label: "Select none", group: SELECT, run: (app) => app.selectKind("none") },
-  { key: "i", ctrl: true, shown: "Ctrl+I", label: "Invert the selection", group: SELECT, run: (app) => app.selectKind("invert") },
-  { key: "escape", shown: "Esc", label: "Cancel, then back to Click", group: SELECT, run: (app) => app.escape() },
-  { key: "enter", shown: "Enter", label: "Keep the selection as an object", group: ORGANISE, run: (app) => app.enter() },
-  { key: "enter", shift: true, shown: "Shift+Enter", label: "Name it first", group: ORGANISE, run: (app) => app.bar.name.focus() },
-  { key: "f2", shown: "F2", label: "Rename", group: ORGANISE, run: (app) => app.renamePicked() },
-  { key: "n", shown: "N", label: "Next suggestion", group: ORGANISE, run: (app) => app.suggestions.walk(1) },
-  { key: "n", shift: true, shown: "Shift+N", label: "Suggestion before", group: ORGANISE, run: (app) => app.suggestions.walk(-1) },
-  { key: "y", shown: "Y", label: "Accept it", group: ORGANISE, run: (app) => app.suggestions.decide("accept") },
-  { key: "x", shown: "X", label: "Reject it", group: ORGANISE, run: (app) => app.suggestions.decide("reject") },
-  { key: "h", shown: "H", label: "Hide the picked objects", group: ORGANISE, run: (app) => app.hide() },
-  { key: "h", shift: true, shown: "Shift+H", label: "Show all", group: ORGANISE, run: (app) => app.showAll() },
-  { key: "z", ctrl: true, shown: "Ctrl+Z", label: "Undo", group: EDIT, run: (app) => app.undo() },
-  { key: "z", ctrl: true, shift: true, shown: "Ctrl+Shift+Z", label: "Redo", group: EDIT, run: (app) => app.redo() },
-  { key: "y", ctrl: true, shown: "", label: "", group: EDIT, run: (app) => app.redo() },
-  { key: "delete", shown: "Del", label: "Remove the selection from the scene", group: EDIT, run: (app) => app.edit("remove") },
-  { key: "1", shown: "1 2 3", label: "Move, rotate, scale", group: EDIT, run: (app) => app.setMove("translate") },
-  { key: "2", shown: "", label: "", group: EDIT, run: (app) => app.setMove("rotate") },
-  { key: "3", shown: "", label: "", group: EDIT, run: (app) => app.setMove("scale") },
-  { key: "e", ctrl: true, shown: "Ctrl+E", label: "Export", group: EDIT, run: (app) => app.exportDialog.open() },
-  { key: "f", shown: "F", label: "Frame the selection", group: LOOK, run: (app) => app.frame(true) },
-  { key: "f", shift: true, shown: "Shift+F", label: "Frame everything", group: LOOK, run: (app) => app.frame(false) },
-  { key: "v", shown: "V", label: "Orbit or fly", group: LOOK, run: (app) => app.toggleFly() },
-  { key: "tab", shown: "Tab", label: "Overlay of objects on and off", group: LOOK, run: (app) => app.toggleOverlay() },
-  { key: "?", shown: "?", label: "This page", group: LOOK, run: (app) => app.helpDialog.open() },
-  { key: "?", shift: true, shown: "", label: "", group: LOOK, run: (app) => app.helpDialog.open() },
-  { key: "flying", shown: "W A S D Q E", label: "Fly; Shift fast, Alt slow", group: LOOK, run: () => false },
-  { key: "arrows", shown: "← ↑ → ↓", label: "Orbit; Shift pans; with Move: steps", group: LOOK, run: () => false },
-  { key: "+", shown: "+ −", label: "Zoom", group: LOOK, run: (app) => app.stage.zoom(1 / 1.15, app.stage.middle()) },
-  { key: "+", shift: true, shown: "", label: "", group: LOOK, run: (app) => app.stage.zoom(1 / 1.15, app.stage.middle()) },
-  { key: "=", shown: "", label: "", group: LOOK, run: (app) => app.stage.zoom(1 / 1.15, app.stage.middle()) },
-  { key: "-", shown: "", label: "", group: LOOK, run: (app) => app.stage.zoom(1.15, app.stage.middle()) },
+  row("c", "C", "Click", SELECT, (app) => app.setTool("click")),
+  row("r", "R", "Box", SELECT, (app) => app.setTool("box")),
+  row("b", "B", "Stroke", SELECT, (app) => app.setTool("stroke")),
+  row("l", "L", "Lasso", SELECT, (app) => app.setTool("lasso")),
+  row("p", "P", "Polygon", SELECT, (app) => app.setTool("polygon")),
+  row("o", "O", "Sphere", SELECT, (app) => app.setTool("sphere")),
+  row("[", "[ ]", "Smaller, larger brush", SELECT, (app) => app.size(1 / 1.2)),
+  row("]", "", "", SELECT, (app) => app.size(1.2)),
+  row(",", ", .", "Level: towards part, group", SELECT, (app) =>
+    app.setLevel(app.store.level - 0.1),
+  ),
+  row(".", "", "", SELECT, (app) => app.setLevel(app.store.level + 0.1)),
+  row(" ", "Space", "Select what is in the middle", SELECT, (app, event) => app.aim(event)),
+  row("shift+ ", "", "", SELECT, (app, event) => app.aim(event)),
+  row("ctrl+ ", "", "", SELECT, (app, event) => app.aim(event)),
+  row("/", "/", "Find by words", SELECT, (app) => app.words.field.focus()),
+  row("ctrl+a", "Ctrl+A", "Select all", SELECT, (app) => app.selectKind("all")),
+  row("ctrl+shift+a", "Ctrl+Shift+A", "Select none", SELECT, (app) => app.selectKind("none")),
+  row("ctrl+i", "Ctrl+I", "Invert the selection", SELECT, (app) => app.selectKind("invert")),
+  row("escape", "Esc", "Cancel, then back to Click", SELECT, (app) => app.escape()),
+  row("enter", "Enter", "Keep the selection as an object", ORGANISE, (app) => app.enter()),
+  row("shift+enter", "Shift+Enter", "Name it first", ORGANISE, (app) => app.bar.name.focus()),
+  row("f2", "F2", "Rename", ORGANISE, (app) => app.renamePicked()),
+  row("n", "N", "Next suggestion", ORGANISE, (app) => app.suggestions.walk(1)),
+  row("shift+n", "Shift+N", "Suggestion before", ORGANISE, (app) => app.suggestions.walk(-1)),
+  row("y", "Y", "Accept it", ORGANISE, (app) => app.suggestions.decide("accept")),
+  row("x", "X", "Reject it", ORGANISE, (app) => app.suggestions.decide("reject")),
+  row("h", "H", "Hide the picked objects", ORGANISE, (app) => app.hide()),
+  row("shift+h", "Shift+H", "Show all", ORGANISE, (app) => app.showAll()),
+  row("ctrl+z", "Ctrl+Z", "Undo", EDIT, (app) => app.undo()),
+  row("ctrl+shift+z", "Ctrl+Shift+Z", "Redo", EDIT, (app) => app.redo()),
+  row("ctrl+y", "", "", EDIT, (app) => app.redo()),
+  row("delete", "Del", "Remove the selection from the scene", EDIT, (app) => app.edit("remove")),
+  row("1", "1 2 3", "Move, rotate, scale", EDIT, (app) => app.setMove("translate")),
+  row("2", "", "", EDIT, (app) => app.setMove("rotate")),
+  row("3", "", "", EDIT, (app) => app.setMove("scale")),
+  row("ctrl+e", "Ctrl+E", "Export", EDIT, (app) => app.exportDialog.open()),
+  row("f", "F", "Frame the selection", LOOK, (app) => app.look.frame(true)),
+  row("shift+f", "Shift+F", "Frame everything", LOOK, (app) => app.look.frame(false)),
+  row("v", "V", "Orbit or fly", LOOK, (app) => app.look.toggleFly()),
+  row("tab", "Tab", "Overlay of objects on and off", LOOK, (app) => app.toggleOverlay()),
+  row("?", "?", "This page", LOOK, (app) => app.helpDialog.open()),
+  row("shift+?", "", "", LOOK, (app) => app.helpDialog.open()),
+  row("flying", "W A S D Q E", "Fly; Shift fast, Alt slow", LOOK, () => false),
+  row("arrows", "← ↑ → ↓", "Orbit; Shift pans; with Move: steps", LOOK, () => false),
+  row("plus", "+ −", "Zoom", LOOK, (app) => app.stage.zoom(1 / 1.15, app.stage.middle())),
+  row("shift+plus", "", "", LOOK, (app) => app.stage.zoom(1 / 1.15, app.stage.middle())),
+  row("=", "", "", LOOK, (app) => app.stage.zoom(1 / 1.15, app.stage.middle())),
+  row("-", "", "", LOOK, (app) => app.stage.zoom(1.15, app.stage.middle())),
 ];
 
 /** `_` stands for a space within one key. */
@@ -77,6 +102,14 @@ export const MOUSE = [
   { shown: "Wheel", label: "Zoom to the pointer" },
   { shown: "Double_click", label: "Turn about this point" },
   { shown: "One_finger", label: "Orbit; two pan and zoom; tap selects" },
+];
+
+export const LIST = [
+  { shown: "↑ ↓", label: "Another row" },
+  { shown: "Enter", label: "Pick it; Ctrl one more, Shift all between" },
+  { shown: "F2", label: "Rename" },
+  { shown: "H K", label: "Hide, lock" },
+  { shown: "Del", label: "Delete the entry; the scene keeps its Gaussians" },
 ];
 
 const FLYING = new Set(["KeyW", "KeyA", "KeyS", "KeyD", "KeyQ", "KeyE"]);
@@ -104,7 +137,9 @@ export class Keys {
     if (event.defaultPrevented || event.isComposing) return;
     const { target } = event;
     const element = target instanceof Element ? target : document.body;
-    const typing = element.matches("input:not([type=radio], [type=checkbox], [type=range]), textarea");
+    const typing = element.matches(
+      "input:not([type=radio], [type=checkbox], [type=range]), textarea",
+    );
     const modal = document.querySelector("dialog[open]") !== null;
     if (typing || modal || element.closest("[role=menu], .popup")) return;
     const { app } = this;
@@ -134,8 +169,7 @@ export class Keys {
       return;
     }
     for (const key of KEYS) {
-      if (key.key !== pressed || Boolean(key.ctrl) !== ctrl) continue;
-      if (Boolean(key.shift) !== event.shiftKey) continue;
+      if (key.key !== pressed || key.ctrl !== ctrl || key.shift !== event.shiftKey) continue;
       if (event.altKey) continue;
       if (key.run(app, event) !== false) event.preventDefault();
       return;

@@ -1,9 +1,9 @@
 /** The page: connects the mirror, the socket, the stage, the tools and the panels. */
 
-import { add, dot, mul, norm, sub, unit } from "./camera.js";
-import { Camera } from "./camera.js";
+import { Camera, mul, unit } from "./camera.js";
 import { bytes, clamp } from "./dom.js";
 import { Keys } from "./keys.js";
+import { Look, replaceFragment } from "./look.js";
 import { ExportDialog } from "./panels/export.js";
 import { HelpDialog } from "./panels/help.js";
 import { JobsPanel } from "./panels/jobs.js";
@@ -32,12 +32,10 @@ import { Words } from "./tools/words.js";
 /**
  * @typedef {import("./state.js").Vec3} Vec3
  * @typedef {import("./state.js").ToolId} ToolId
- * @typedef {import("./state.js").SceneObject} SceneObject
  * @typedef {import("./socket.js").Message} Message
  */
 
 const HINT_AFTER = 1200;
-const REMEMBER_AFTER = 400;
 
 export class App {
   constructor() {
@@ -63,6 +61,7 @@ export class App {
     };
     this.toasts = new Toasts();
     this.stage = new Stage(this);
+    this.look = new Look(this);
     this.keys = new Keys(this);
     this.words = new Words(this);
     this.jobs = new JobsPanel(this);
@@ -84,7 +83,6 @@ export class App {
     /** Whether the selection that a double click began is taken back when it comes. */
     this.reverting = false;
     this.hintTimer = 0;
-    this.rememberTimer = 0;
     /** Camera of the link that opened the page. @type {string|null} */
     this.link = null;
     this.started = false;
@@ -93,22 +91,17 @@ export class App {
   start() {
     const { token, view } = readFragment(location.hash);
     this.link = view;
-    if (token) this.replaceFragment(view === null ? "" : `#view=${view}`);
+    if (token) replaceFragment(view === null ? "" : `#view=${view}`);
     this.store.changed("tool");
     void this.socket.start(token);
     window.addEventListener("hashchange", () => {
       const next = readFragment(location.hash);
       if (next.token) {
-        this.replaceFragment("");
+        replaceFragment("");
         void this.socket.start(next.token);
       }
       if (next.view) this.stage.go((camera) => void camera.fromLink(next.view ?? ""));
     });
-  }
-
-  /** @param {string} fragment */
-  replaceFragment(fragment) {
-    history.replaceState(null, "", `${location.pathname}${location.search}${fragment}`);
   }
 
   /** @param {Message} message @returns {boolean} */
@@ -188,26 +181,13 @@ export class App {
     if (!this.started) {
       this.started = true;
       this.camera.up = unit(scene.up ?? [0, 0, 1]);
-      if (!this.link || !this.camera.fromLink(this.link)) this.goHome();
+      if (!this.link || !this.camera.fromLink(this.link)) this.look.goHome();
       this.stage.resize();
     }
     if (!scene.modes.includes(this.store.mode)) this.store.mode = scene.modes[0] ?? "colour";
     this.store.changed("mode");
     this.waiting = 0;
     this.server.reset();
-  }
-
-  goHome() {
-    const { scene } = this.store;
-    if (!scene) return;
-    const { matrix, focal, width, height } = scene.home;
-    this.camera.focal = clamp(focal / Math.max(width, height), 0.2, 5);
-    const ahead = dot(sub(scene.centre, [matrix[3], matrix[7], matrix[11]]), [
-      matrix[2],
-      matrix[6],
-      matrix[10],
-    ]);
-    this.camera.setMatrix(matrix, ahead > 0 ? ahead : scene.radius * 0.5);
   }
 
   /** @param {import("./state.js").PatchMessage} message */
@@ -281,7 +261,11 @@ export class App {
     const revision = this.waiting === 0 ? this.store.document.revision : null;
     const sent = this.send({ type: "command", name, arguments: args, revision });
     if (sent) this.waiting += 1;
-    else this.toast("There is no connection to the server.", "It comes back by itself; then try again.");
+    else
+      this.toast(
+        "There is no connection to the server.",
+        "It comes back by itself; then try again.",
+      );
     return sent;
   }
 
@@ -466,85 +450,9 @@ export class App {
     this.command("recolour", { colour: bytes(colour) });
   }
 
-  /**
-   * A plane through the pivot, where it lies in the object, else through its middle.
-   * @param {SceneObject} object
-   * @param {"upright"|"level"} kind
-   * @returns {number[]} a, b, c, d with a x + b y + c z + d = 0
-   */
-  cuttingPlane(object, kind) {
-    const { camera } = this;
-    const centre = object.centre ?? camera.pivot;
-    const inside = norm(sub(camera.pivot, centre)) < (object.radius ?? 0);
-    const point = inside ? camera.pivot : centre;
-    const flat = sub(camera.right, mul(camera.up, dot(camera.right, camera.up)));
-    const normal = kind === "level" ? camera.up : unit(flat);
-    return [...normal, -dot(normal, point)];
-  }
-
-  /** @param {boolean} selection Or the whole scene. */
-  frame(selection) {
-    const { scene } = this.store;
-    if (!scene) return;
-    const subject = selection ? this.tools.move.subject() : null;
-    if (subject) {
-      const { about, radius } = subject;
-      this.stage.go((camera) => camera.frame(about, radius || camera.radius * 0.1));
-    } else if (selection) this.toast("Nothing is selected.", "Shift+F frames everything.");
-    else this.stage.go((camera) => camera.frame(scene.centre, scene.radius));
-  }
-
-  toggleFly() {
-    this.stage.movement = this.stage.movement === "orbit" ? "fly" : "orbit";
-    this.store.changed("tool");
-  }
-
-  /** @param {Vec3} up */
-  setUp(up) {
-    this.stage.go((camera) => {
-      camera.up = unit(up);
-      const away = norm(sub(camera.pivot, camera.position));
-      const flat = sub(camera.forward, mul(camera.up, dot(camera.forward, camera.up)));
-      if (norm(flat) < 0.1) {
-        const side = Math.abs(camera.up[0]) > 0.9 ? /** @type {Vec3} */ ([0, 1, 0]) : /** @type {Vec3} */ ([1, 0, 0]);
-        camera.position = sub(camera.pivot, mul(unit(add(side, mul(camera.up, -0.4))), away));
-      }
-      camera.lookAt(camera.pivot);
-    });
-  }
-
-  goToHint() {
-    const view = this.store.hint?.view;
-    const found = view ? this.store.view(view) : null;
-    if (found) this.views.goTo(found);
-  }
-
   /** @param {string} id Of a panel; on a narrow page it comes up. */
   showPanel(id) {
     if (matchMedia("(max-width: 760px)").matches) this.top.sheet(id);
-  }
-
-  /** Keep the camera in the address, so that a reload comes back here. */
-  rememberCamera() {
-    if (!this.started) return;
-    clearTimeout(this.rememberTimer);
-    this.rememberTimer = setTimeout(
-      () => this.replaceFragment(`#view=${this.camera.toLink()}`),
-      REMEMBER_AFTER,
-    );
-  }
-
-  async copyLink() {
-    const address = `${location.origin}${location.pathname}#view=${this.camera.toLink()}`;
-    this.replaceFragment(`#view=${this.camera.toLink()}`);
-    try {
-      await navigator.clipboard.writeText(address);
-      this.toasts.show("The link to this view is copied.", "", { good: true });
-    } catch {
-      this.toasts.show("The link to this view is in the address line.", "Copy it from there.", {
-        good: true,
-      });
-    }
   }
 }
 

@@ -121,7 +121,11 @@ export class ExportDialog {
 
   build() {
     const { kind } = this;
-    const kinds = el("fieldset", { class: "kinds" }, el("legend", { class: "unseen", text: "What to export" }));
+    const kinds = el(
+      "fieldset",
+      { class: "kinds" },
+      el("legend", { class: "unseen", text: "What to export" }),
+    );
     for (const item of this.kinds()) {
       const id = `kind-${item.id}`;
       kinds.append(
@@ -166,7 +170,12 @@ export class ExportDialog {
       el(
         "div",
         { class: "form-buttons" },
-        el("button", { type: "button", class: "button", text: "Cancel", onclick: () => this.dialog.close() }),
+        el("button", {
+          type: "button",
+          class: "button",
+          text: "Cancel",
+          onclick: () => this.dialog.close(),
+        }),
         el("button", {
           type: "submit",
           class: "button primary",
@@ -200,18 +209,30 @@ export class ExportDialog {
     select.addEventListener("change", () => {
       this.format = select.value;
     });
-    return el("label", { class: "form-row", for: "export-format" }, el("span", { text: "Format" }), select);
+    return el(
+      "label",
+      { class: "form-row", for: "export-format" },
+      el("span", { text: "Format" }),
+      select,
+    );
   }
 
   whichField() {
     const { store } = this.app;
     const picked = store.picked.size;
     const select = el("select", { id: "export-which" });
-    const all = this.kind.id === "splat" ? "The whole scene" : `All ${store.document.objects.length} objects`;
+    const all =
+      this.kind.id === "splat" ? "The whole scene" : `All ${store.document.objects.length} objects`;
     select.append(el("option", { value: "all", text: all }));
-    const text = picked === 1 ? `Only ${store.pickedObjects()[0].name}` : `Only the ${picked} picked objects`;
+    const text =
+      picked === 1 ? `Only ${store.pickedObjects()[0].name}` : `Only the ${picked} picked objects`;
     if (picked > 0) select.append(el("option", { value: "picked", text, selected: true }));
-    return el("label", { class: "form-row", for: "export-which" }, el("span", { text: "Which" }), select);
+    return el(
+      "label",
+      { class: "form-row", for: "export-which" },
+      el("span", { text: "Which" }),
+      select,
+    );
   }
 
   lengthField() {
@@ -220,7 +241,12 @@ export class ExportDialog {
       const text = `${seconds} seconds`;
       select.append(el("option", { value: seconds * 30, text, selected: seconds === 4 }));
     }
-    return el("label", { class: "form-row", for: "export-frames" }, el("span", { text: "Length" }), select);
+    return el(
+      "label",
+      { class: "form-row", for: "export-frames" },
+      el("span", { text: "Length" }),
+      select,
+    );
   }
 
   defaultName() {
@@ -237,7 +263,9 @@ export class ExportDialog {
     const { app, kind } = this;
     const value = (/** @type {string} */ id) => {
       const field = form.querySelector(`#${id}`);
-      return field instanceof HTMLInputElement || field instanceof HTMLSelectElement ? field.value : "";
+      return field instanceof HTMLInputElement || field instanceof HTMLSelectElement
+        ? field.value
+        : "";
     };
     const name = value("export-name").trim();
     const label = `${kind.label} ${name}`;

@@ -1,7 +1,7 @@
 /** All keys and what the mouse does, from the table that the keys are read from. */
 
 import { byId, el, iconButton } from "../dom.js";
-import { KEYS, MOUSE } from "../keys.js";
+import { KEYS, LIST, MOUSE } from "../keys.js";
 
 /** @typedef {import("../main.js").App} App */
 
@@ -24,7 +24,13 @@ export class HelpDialog {
       if (key.shown) group.push({ shown: key.shown, label: key.label });
       groups.set(key.group, group);
     }
-    const body = el("div", { class: "help-body", tabindex: 0, role: "group", "aria-label": "Keys" });
+    groups.set("In the list of objects", [...LIST]);
+    const body = el("div", {
+      class: "help-body",
+      tabindex: 0,
+      role: "group",
+      "aria-label": "Keys",
+    });
     for (const [title, rows] of groups) {
       const list = el("dl", {});
       for (const { shown, label } of rows) {

@@ -30,11 +30,16 @@ export class JobsPanel {
     if (!this.app.send({ type: "job", id, name, arguments: args })) return;
     const bar = el("progress", { max: 1, "aria-label": label });
     const text = el("span", { class: "quiet", text: "starting…" });
-    const cancel = iconButton("close", `Cancel: ${label}`, () => {
-      this.app.send({ type: "cancel", id });
-      text.textContent = "cancelling…";
-      cancel.disabled = true;
-    }, { class: "plain" });
+    const cancel = iconButton(
+      "close",
+      `Cancel: ${label}`,
+      () => {
+        this.app.send({ type: "cancel", id });
+        text.textContent = "cancelling…";
+        cancel.disabled = true;
+      },
+      { class: "plain" },
+    );
     const row = el(
       "div",
       { class: "job" },
@@ -78,7 +83,10 @@ export class JobsPanel {
       const href = await this.app.socket.address(path);
       this.app.toasts.show(text, "", { good: true, links: [{ text: name, href, download: name }] });
     } catch {
-      this.app.toast(`${name} was written, but could not be fetched.`, "It lies in the scene's folder exports.");
+      this.app.toast(
+        `${name} was written, but could not be fetched.`,
+        "It lies in the scene's folder exports.",
+      );
     }
   }
 
@@ -104,7 +112,11 @@ export class JobsPanel {
   forget() {
     for (const id of [...this.jobs.keys()]) {
       const job = this.remove(id);
-      if (job) this.app.toast(`${job.label}: the connection was lost.`, "See whether the file is there, or start it again.");
+      if (job)
+        this.app.toast(
+          `${job.label}: the connection was lost.`,
+          "See whether the file is there, or start it again.",
+        );
     }
   }
 }

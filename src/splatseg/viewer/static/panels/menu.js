@@ -13,7 +13,12 @@ import { el, icon } from "../dom.js";
  * @param {Item[]} items
  */
 export function openMenu(button, items) {
-  const menu = el("div", { class: "menu", role: "menu", popover: "auto", "aria-label": button.title });
+  const menu = el("div", {
+    class: "menu",
+    role: "menu",
+    popover: "auto",
+    "aria-label": button.title,
+  });
   /** @type {HTMLButtonElement[]} */
   const entries = [];
   for (const item of items) {
@@ -65,7 +70,8 @@ export function openMenu(button, items) {
   menu.addEventListener("toggle", (event) => {
     if (/** @type {ToggleEvent} */ (event).newState !== "closed") return;
     button.setAttribute("aria-expanded", "false");
-    const inside = menu.contains(document.activeElement) || document.activeElement === document.body;
+    const inside =
+      menu.contains(document.activeElement) || document.activeElement === document.body;
     menu.remove();
     if (inside) button.focus();
   });

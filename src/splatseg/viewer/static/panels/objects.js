@@ -55,8 +55,15 @@ export class ObjectsPanel {
     });
     this.list.box.setAttribute("aria-multiselectable", "true");
     this.empty = el("div", { class: "empty" });
-    this.actions = el("div", { class: "row-actions", role: "group", "aria-label": "Picked objects" });
-    this.showAll = iconButton("eye", "Show all objects", () => app.showAll(), { key: "Shift+H", class: "small" });
+    this.actions = el("div", {
+      class: "row-actions",
+      role: "group",
+      "aria-label": "Picked objects",
+    });
+    this.showAll = iconButton("eye", "Show all objects", () => app.showAll(), {
+      key: "Shift+H",
+      class: "small",
+    });
     const head = el(
       "div",
       { class: "panel-head" },
@@ -141,10 +148,16 @@ export class ObjectsPanel {
     const one = picked.length === 1 ? picked[0] : null;
     const locked = picked.some((object) => object.locked);
     const only = one !== null && store.only === one.id;
-    const split = iconButton("split", "Split", () => this.splitMenu(split, /** @type {SceneObject} */ (one)));
+    const split = iconButton("split", "Split", () =>
+      this.splitMenu(split, /** @type {SceneObject} */ (one)),
+    );
     const classes = iconButton("tag", "Class", () => this.classDialog(classes, picked));
-    const more = iconButton("more", "More for the picked objects", () => this.moreMenu(more, picked));
-    const join = iconButton("join", "Join", () => app.command("join", { ids, name: picked[0].name }));
+    const more = iconButton("more", "More for the picked objects", () =>
+      this.moreMenu(more, picked),
+    );
+    const join = iconButton("join", "Join", () =>
+      app.command("join", { ids, name: picked[0].name }),
+    );
     join.disabled = picked.length < 2 || locked;
     split.disabled = one === null || locked;
     const alone = iconButton("isolate", only ? "Show with the others" : "Show alone", () =>
@@ -160,10 +173,15 @@ export class ObjectsPanel {
       app.command("refine", { id: /** @type {SceneObject} */ (one).id }),
     );
     replace.disabled = one === null || locked;
-    const remove = iconButton("trash", "Delete from the list", () => app.command("delete", { ids }));
+    const remove = iconButton("trash", "Delete from the list", () =>
+      app.command("delete", { ids }),
+    );
     remove.disabled = locked;
     this.actions.replaceChildren(
-      el("span", { class: "quiet picked-count", text: one ? "1 picked" : `${picked.length} picked` }),
+      el("span", {
+        class: "quiet picked-count",
+        text: one ? "1 picked" : `${picked.length} picked`,
+      }),
       join,
       split,
       subtract,
@@ -184,17 +202,22 @@ export class ObjectsPanel {
       app.command("split", { id: object.id, ...how });
     openMenu(button, [
       { label: "Connected parts", icon: "split", action: () => split({ by: "parts" }) },
-      { label: "Parts of the tree", icon: "layers", disabled: !tree, action: () => split({ by: "tree" }) },
+      {
+        label: "Parts of the tree",
+        icon: "layers",
+        disabled: !tree,
+        action: () => split({ by: "tree" }),
+      },
       "line",
       {
         label: "Left and right of the pivot",
         icon: "split",
-        action: () => split({ by: "plane", plane: app.cuttingPlane(object, "upright") }),
+        action: () => split({ by: "plane", plane: app.look.cuttingPlane(object, "upright") }),
       },
       {
         label: "Above and below the pivot",
         icon: "minus",
-        action: () => split({ by: "plane", plane: app.cuttingPlane(object, "level") }),
+        action: () => split({ by: "plane", plane: app.look.cuttingPlane(object, "level") }),
       },
     ]);
   }
@@ -213,7 +236,7 @@ export class ObjectsPanel {
         disabled: picked.length !== 1,
         action: () => this.rename(ids[0]),
       },
-      { label: "Frame", icon: "frame", key: "F", action: () => app.frame(true) },
+      { label: "Frame", icon: "frame", key: "F", action: () => app.look.frame(true) },
       {
         label: visible ? "Hide" : "Show",
         icon: visible ? "eye-off" : "eye",
@@ -227,8 +250,17 @@ export class ObjectsPanel {
         action: () => app.command("set_locked", { ids, locked: !locked }),
       },
       "line",
-      { label: "Duplicate in the scene", icon: "duplicate", action: () => app.edit("duplicate", undefined, ids) },
-      { label: "Remove from the scene", icon: "trash", key: "Del", action: () => app.edit("remove", undefined, ids) },
+      {
+        label: "Duplicate in the scene",
+        icon: "duplicate",
+        action: () => app.edit("duplicate", undefined, ids),
+      },
+      {
+        label: "Remove from the scene",
+        icon: "trash",
+        key: "Del",
+        action: () => app.edit("remove", undefined, ids),
+      },
       { label: "Export…", icon: "export", action: () => app.exportDialog.open("objects") },
     ]);
   }
@@ -252,7 +284,12 @@ export class ObjectsPanel {
       "form",
       { class: "popup", popover: "auto" },
       el("label", { for: "class-name", text: `Class of ${counted(picked.length, "object")}` }),
-      el("div", { class: "line" }, input, el("button", { type: "submit", class: "button primary", text: "Set" })),
+      el(
+        "div",
+        { class: "line" },
+        input,
+        el("button", { type: "submit", class: "button primary", text: "Set" }),
+      ),
       list,
     );
     form.addEventListener("submit", (event) => {
@@ -311,7 +348,9 @@ export class ObjectsPanel {
     );
     const row = el(
       "div",
-      { title: `${object.name}: ${counted(object.count, "Gaussian")}, from ${object.source || "a selection"}` },
+      {
+        title: `${object.name}: ${counted(object.count, "Gaussian")}, from ${object.source || "a selection"}`,
+      },
       swatch,
       label,
       el("span", { class: "cell size", role: "gridcell", text: compact(object.count) }),

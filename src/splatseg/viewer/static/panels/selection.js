@@ -51,8 +51,11 @@ export class SelectionBar {
     this.name.addEventListener("keydown", (event) => {
       if (event.key === "Escape") app.stage.focus();
     });
-    const shape = (/** @type {string} */ name, /** @type {string} */ label, /** @type {string} */ kind) =>
-      iconButton(name, label, () => app.selectKind(kind));
+    const shape = (
+      /** @type {string} */ name,
+      /** @type {string} */ label,
+      /** @type {string} */ kind,
+    ) => iconButton(name, label, () => app.selectKind(kind));
     this.shapes = el(
       "div",
       { class: "group", role: "group", "aria-label": "Shape of the selection" },
@@ -61,9 +64,16 @@ export class SelectionBar {
       shape("fill", "Fill holes", "fill"),
       shape("similar", "More like this", "similar"),
     );
-    this.remove = iconButton("trash", "Remove from the scene", () => app.edit("remove"), { key: "Del" });
+    this.remove = iconButton("trash", "Remove from the scene", () => app.edit("remove"), {
+      key: "Del",
+    });
     const more = iconButton("more", "More for the selection", () => this.menu(more));
-    this.colour = el("input", { type: "color", class: "unseen", tabindex: -1, "aria-hidden": "true" });
+    this.colour = el("input", {
+      type: "color",
+      class: "unseen",
+      tabindex: -1,
+      "aria-hidden": "true",
+    });
     this.colour.addEventListener("change", () => app.recolour(this.colour.value));
     this.edits = el(
       "div",
@@ -81,7 +91,7 @@ export class SelectionBar {
     );
     this.hintButton = el(
       "button",
-      { type: "button", class: "button hint", hidden: true, onclick: () => app.goToHint() },
+      { type: "button", class: "button hint", hidden: true, onclick: () => app.look.goToHint() },
       icon("spark"),
       el("span", { text: "Next click" }),
     );
@@ -113,9 +123,25 @@ export class SelectionBar {
     const any = app.store.document.selection !== null;
     const layers = app.store.features.has("layer") ? (app.store.scene?.layers ?? []) : [];
     openMenu(button, [
-      { label: "Duplicate", icon: "duplicate", disabled: !any, action: () => app.edit("duplicate") },
-      { label: "Recolour…", icon: "colour", disabled: !any, action: () => this.colour.showPicker() },
-      { label: "Move", icon: "move", key: "1", disabled: !any, action: () => app.setMove("translate") },
+      {
+        label: "Duplicate",
+        icon: "duplicate",
+        disabled: !any,
+        action: () => app.edit("duplicate"),
+      },
+      {
+        label: "Recolour…",
+        icon: "colour",
+        disabled: !any,
+        action: () => this.colour.showPicker(),
+      },
+      {
+        label: "Move",
+        icon: "move",
+        key: "1",
+        disabled: !any,
+        action: () => app.setMove("translate"),
+      },
       "line",
       { label: "Select all", icon: "set", key: "Ctrl A", action: () => app.selectKind("all") },
       { label: "Invert", icon: "intersect", key: "Ctrl I", action: () => app.selectKind("invert") },
@@ -143,7 +169,11 @@ export class SelectionBar {
     const busy = gestures.pending !== 0;
     this.bar.toggleAttribute("data-busy", busy);
     this.bar.toggleAttribute("data-empty", !shown);
-    this.count.textContent = shown ? counted(shown.count, "Gaussian") : busy ? "Selecting…" : "Nothing selected";
+    this.count.textContent = shown
+      ? counted(shown.count, "Gaussian")
+      : busy
+        ? "Selecting…"
+        : "Nothing selected";
     this.sure.textContent = shown ? `${percent(shown.confidence)} sure` : "";
     this.sure.hidden = !shown;
     this.level.value = String(store.level);

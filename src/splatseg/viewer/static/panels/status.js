@@ -19,7 +19,14 @@ export class StatusLine {
     this.saved = el("span", {});
     this.people = el("span", {});
     this.box.append(
-      this.says, this.count, this.size, this.times, this.draws, this.edits, this.saved, this.people,
+      this.says,
+      this.count,
+      this.size,
+      this.times,
+      this.draws,
+      this.edits,
+      this.saved,
+      this.people,
     );
     app.store.on(["status", "scene", "connection", "tool", "selection"], () => this.show());
     this.show();
@@ -44,7 +51,8 @@ export class StatusLine {
     const edits = store.document.edits.length;
     this.edits.textContent = edits > 0 ? counted(edits, "edit") : "";
     this.saved.textContent = open ? "saved" : "";
-    this.people.textContent = open && store.clients > 1 ? counted(store.clients, "person", "people") : "";
+    this.people.textContent =
+      open && store.clients > 1 ? counted(store.clients, "person", "people") : "";
     for (const part of this.box.children) {
       if (part instanceof HTMLElement) part.hidden = part.textContent === "";
     }
@@ -56,7 +64,8 @@ export class StatusLine {
     const texts = {
       connecting: store.scene ? "Connecting again…" : "Opening the scene…",
       lost: "The server is away. Trying again by itself; what was done is kept.",
-      refused: "This page is not let in. Open the address that the command printed, with its token.",
+      refused:
+        "This page is not let in. Open the address that the command printed, with its token.",
       full: "Too many people look at this scene. Close another page of it and reload.",
       open: "",
     };
@@ -76,7 +85,12 @@ export class StatusLine {
     this.notice.append(el("span", { text }));
     if (store.connection === "lost" || store.connection === "refused") {
       this.notice.append(
-        el("button", { type: "button", class: "button small", text: "Try now", onclick: () => socket.retry() }),
+        el("button", {
+          type: "button",
+          class: "button small",
+          text: "Try now",
+          onclick: () => socket.retry(),
+        }),
       );
     }
   }

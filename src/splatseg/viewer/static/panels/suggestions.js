@@ -32,7 +32,9 @@ export class SuggestionsPanel {
       el("button", { type: "button", class: "button small", text, onclick: () => this.all(name) });
     this.acceptAll = button("accept", "Accept all");
     this.rejectAll = button("reject", "Reject all");
-    const layers = iconButton("layers", "Suggest from a layer", () => this.layerMenu(layers), { class: "small" });
+    const layers = iconButton("layers", "Suggest from a layer", () => this.layerMenu(layers), {
+      class: "small",
+    });
     this.layers = layers;
     this.offer = el("div", { class: "offer" });
     this.section.append(
@@ -73,12 +75,16 @@ export class SuggestionsPanel {
           class: "quiet",
           text: "A click goes by colour, place and connected pieces until they are made.",
         }),
-        iconButton("spark", "Make masks", () => this.app.jobs.start("see", {}, "Making masks"), { text: true }),
+        iconButton("spark", "Make masks", () => this.app.jobs.start("see", {}, "Making masks"), {
+          text: true,
+        }),
       );
     } else {
       this.offer.append(
         el("p", { class: "quiet", text: "Objects that a layer knows can be suggested here." }),
-        iconButton("layers", "Suggest from a layer…", () => this.layerMenu(this.layers), { text: true }),
+        iconButton("layers", "Suggest from a layer…", () => this.layerMenu(this.layers), {
+          text: true,
+        }),
       );
     }
   }
@@ -102,7 +108,11 @@ export class SuggestionsPanel {
     const row = el(
       "div",
       { title: `${number(item.count)} Gaussians` },
-      el("span", { class: "cell label", role: "gridcell" }, el("span", { class: "name", text: item.name })),
+      el(
+        "span",
+        { class: "cell label", role: "gridcell" },
+        el("span", { class: "name", text: item.name }),
+      ),
       el("span", { class: "cell sure", role: "gridcell", text: percent(item.score) }),
       el(
         "span",

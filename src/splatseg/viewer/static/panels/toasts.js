@@ -21,7 +21,11 @@ export class Toasts {
     }
     const toast = el(
       "div",
-      { class: `toast ${good ? "good" : "bad"}`, role: good ? "status" : "alert", "data-text": text },
+      {
+        class: `toast ${good ? "good" : "bad"}`,
+        role: good ? "status" : "alert",
+        "data-text": text,
+      },
       icon(good ? "check" : "help"),
       el(
         "div",
@@ -36,7 +40,10 @@ export class Toasts {
     );
     this.box.append(toast);
     while (this.box.children.length > MOST) this.box.firstElementChild?.remove();
-    let timer = setTimeout(() => toast.remove(), links.length > 0 ? 4 * STAYS : good ? STAYS / 2 : STAYS);
+    let timer = setTimeout(
+      () => toast.remove(),
+      links.length > 0 ? 4 * STAYS : good ? STAYS / 2 : STAYS,
+    );
     toast.addEventListener("pointerenter", () => clearTimeout(timer));
     toast.addEventListener("focusin", () => clearTimeout(timer));
     toast.addEventListener("pointerleave", () => {

@@ -31,7 +31,12 @@ const SELECT_MODES = [
   { mode: "set", icon: "set", label: "New selection", key: "no modifier" },
   { mode: "add", icon: "plus", label: "Add to the selection", key: "Shift" },
   { mode: "remove", icon: "minus", label: "Remove from the selection", key: "Ctrl" },
-  { mode: "intersect", icon: "intersect", label: "Intersect with the selection", key: "Shift+Ctrl" },
+  {
+    mode: "intersect",
+    icon: "intersect",
+    label: "Intersect with the selection",
+    key: "Shift+Ctrl",
+  },
 ];
 
 export class ToolPanel {
@@ -49,7 +54,11 @@ export class ToolPanel {
 
   build() {
     const { app } = this;
-    const select = el("div", { class: "tool-group", role: "group", "aria-label": "Selection tools" });
+    const select = el("div", {
+      class: "tool-group",
+      role: "group",
+      "aria-label": "Selection tools",
+    });
     for (const { id, label, key } of TOOLS) {
       const button = iconButton(id, label, () => app.setTool(id), { key });
       this.buttons.set(id, button);
@@ -63,10 +72,10 @@ export class ToolPanel {
     }
     const look = el("div", { class: "tool-group", role: "group", "aria-label": "View" });
     look.append(
-      iconButton("frame", "Frame the selection", () => app.frame(true), { key: "F" }),
-      iconButton("home", "Frame everything", () => app.frame(false), { key: "Shift+F" }),
+      iconButton("frame", "Frame the selection", () => app.look.frame(true), { key: "F" }),
+      iconButton("home", "Frame everything", () => app.look.frame(false), { key: "Shift+F" }),
     );
-    const fly = iconButton("fly", "Fly", () => app.toggleFly(), { key: "V" });
+    const fly = iconButton("fly", "Fly", () => app.look.toggleFly(), { key: "V" });
     this.buttons.set("fly", fly);
     look.append(fly);
     this.rail.append(select, edit, look);
@@ -98,7 +107,12 @@ export class ToolPanel {
     if (store.tool === "click") {
       const kinds = /** @type {const} */ ([
         { mode: "new", text: "New", label: "A click is a new prompt", key: "" },
-        { mode: "more", text: "+ Point", label: "A click is a point for the same thing", key: "Alt+Shift" },
+        {
+          mode: "more",
+          text: "+ Point",
+          label: "A click is a point for the same thing",
+          key: "Alt+Shift",
+        },
         { mode: "less", text: "− Point", label: "A click is a point against it", key: "Alt" },
       ]);
       options.append(
@@ -110,12 +124,16 @@ export class ToolPanel {
     }
     if (store.tool === "stroke") {
       options.append(
-        slider("brush", "Brush", 2, 120, tools.stroke.width, (width) => tools.stroke.setWidth(width)),
+        slider("brush", "Brush", 2, 120, tools.stroke.width, (width) =>
+          tools.stroke.setWidth(width),
+        ),
       );
     }
     if (store.tool === "sphere") {
       options.append(
-        slider("ball", "Radius", 4, 250, tools.sphere.radius, (size) => tools.sphere.setRadius(size)),
+        slider("ball", "Radius", 4, 250, tools.sphere.radius, (size) =>
+          tools.sphere.setRadius(size),
+        ),
       );
     }
     if (store.tool === "polygon") {
@@ -137,7 +155,11 @@ export class ToolPanel {
  * @param {(mode: M) => void} choose
  */
 function segments(name, legend, choices, value, choose) {
-  const box = el("fieldset", { class: "segments" }, el("legend", { class: "unseen", text: legend }));
+  const box = el(
+    "fieldset",
+    { class: "segments" },
+    el("legend", { class: "unseen", text: legend }),
+  );
   for (const choice of choices) {
     const id = `${name}-${choice.mode}`;
     const input = el("input", {

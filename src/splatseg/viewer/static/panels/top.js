@@ -57,7 +57,7 @@ export class TopBar {
       class: "primary",
     });
     byId("actions", HTMLElement).append(
-      iconButton("link", "Copy a link to this view", () => app.copyLink()),
+      iconButton("link", "Copy a link to this view", () => app.look.copyLink()),
       iconButton("help", "Keys and mouse", () => app.helpDialog.open(), { key: "?" }),
       settings,
       exports,
@@ -65,7 +65,11 @@ export class TopBar {
     this.tabs = byId("sheet-tabs", HTMLElement);
     /** @type {Map<string, HTMLButtonElement>} */
     this.tabButtons = new Map();
-    for (const [id, label] of [["objects", "Objects"], ["suggestions", "Suggested"], ["views", "Photographs"]]) {
+    for (const [id, label] of [
+      ["objects", "Objects"],
+      ["suggestions", "Suggested"],
+      ["views", "Photographs"],
+    ]) {
       const tab = el("button", {
         type: "button",
         role: "tab",
@@ -105,7 +109,8 @@ export class TopBar {
       input.checked = input.value === store.mode;
     }
     const { suggestions } = store.document;
-    const tab = (/** @type {string} */ id) => /** @type {HTMLButtonElement} */ (this.tabButtons.get(id));
+    const tab = (/** @type {string} */ id) =>
+      /** @type {HTMLButtonElement} */ (this.tabButtons.get(id));
     tab("objects").textContent = `Objects ${store.document.objects.length || ""}`;
     tab("suggestions").textContent = `Suggested ${suggestions.length || ""}`;
     tab("views").hidden = (store.scene?.views.length ?? 0) === 0;
@@ -179,20 +184,24 @@ export class TopBar {
         label: "Orbit",
         key: "V",
         checked: app.stage.movement === "orbit",
-        action: () => app.stage.movement === "fly" && app.toggleFly(),
+        action: () => app.stage.movement === "fly" && app.look.toggleFly(),
       },
       {
         label: "Fly",
         key: "V",
         checked: app.stage.movement === "fly",
-        action: () => app.stage.movement === "orbit" && app.toggleFly(),
+        action: () => app.stage.movement === "orbit" && app.look.toggleFly(),
       },
       { title: "Up" },
-      { label: "As the scene says", checked: !known || up === sceneUp.join(), action: () => app.setUp(sceneUp) },
+      {
+        label: "As the scene says",
+        checked: !known || up === sceneUp.join(),
+        action: () => app.look.setUp(sceneUp),
+      },
       ...UPS.filter((item) => item.up.join() !== sceneUp.join()).map((item) => ({
         label: item.label,
         checked: same(item.up),
-        action: () => app.setUp(item.up),
+        action: () => app.look.setUp(item.up),
       })),
       { title: "Keys" },
       {

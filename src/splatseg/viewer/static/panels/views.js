@@ -14,20 +14,30 @@ export class ViewsPanel {
   constructor(app) {
     this.app = app;
     this.section = byId("views", HTMLElement);
+    this.title = el("span", { text: "Photographs " });
     this.count = el("span", { class: "count" });
     this.strip = el("div", { class: "strip", role: "group", "aria-label": "Photographs" });
     /** Where the camera stands, if at a photograph's place. @type {string|null} */
     this.current = null;
-    this.compare = iconButton("compare", "Compare with the photograph", () => this.toggleCompare(), {
-      class: "small",
+    this.compare = iconButton(
+      "compare",
+      "Compare with the photograph",
+      () => this.toggleCompare(),
+      {
+        class: "small",
+      },
+    );
+    const previous = iconButton("chevron", "Photograph before", () => this.step(-1), {
+      class: "small left",
     });
-    const previous = iconButton("chevron", "Photograph before", () => this.step(-1), { class: "small left" });
-    const next = iconButton("chevron", "Next photograph", () => this.step(1), { class: "small right" });
+    const next = iconButton("chevron", "Next photograph", () => this.step(1), {
+      class: "small right",
+    });
     this.section.append(
       el(
         "div",
         { class: "panel-head" },
-        el("h2", { id: "views-title" }, "Photographs ", this.count),
+        el("h2", { id: "views-title" }, this.title, this.count),
         el("span", { class: "grow" }),
         previous,
         next,
@@ -54,6 +64,9 @@ export class ViewsPanel {
   build() {
     const views = this.app.store.scene?.views ?? [];
     this.section.hidden = views.length === 0;
+    const photographs = views.some((view) => view.photograph);
+    this.title.textContent = photographs ? "Photographs " : "Cameras ";
+    this.compare.hidden = !photographs;
     const names = views.map((view) => view.name).join("\n");
     if (this.strip.dataset.names === names) return;
     this.strip.dataset.names = names;

@@ -114,7 +114,14 @@ export class VirtualList {
   keydown(event) {
     if (event.target !== this.box) return;
     const page = Math.max(1, Math.floor(this.box.clientHeight / this.options.height) - 1);
-    const steps = { ArrowDown: 1, ArrowUp: -1, PageDown: page, PageUp: -page, Home: -1e9, End: 1e9 };
+    const steps = {
+      ArrowDown: 1,
+      ArrowUp: -1,
+      PageDown: page,
+      PageUp: -page,
+      Home: -1e9,
+      End: 1e9,
+    };
     const step = steps[/** @type {keyof typeof steps} */ (event.key)];
     const index = this.items.findIndex((item) => this.options.id(item) === this.activeId);
     if (step && this.items.length > 0) {

@@ -53,7 +53,11 @@ export class Photograph {
     this.view = view;
     this.pose = this.app.camera.matrix().join();
     this.app.store.photograph = view.name;
-    const width = Math.min(1600, view.width, Math.ceil(this.stage.box.clientWidth * this.stage.ratio));
+    const width = Math.min(
+      1600,
+      view.width,
+      Math.ceil(this.stage.box.clientWidth * this.stage.ratio),
+    );
     const path = `/photographs/${encodeURIComponent(view.name)}?width=${width}`;
     try {
       this.image.src = await this.app.socket.address(path);

@@ -15,9 +15,9 @@
  *   draw?: (g: CanvasRenderingContext2D, ratio: number) => void}} Tool
  */
 
-import { Camera, add, between, mul, sub } from "../camera.js";
+import { Camera, add, between, mul } from "../camera.js";
 import { byId, calm, clamp } from "../dom.js";
-import { outline } from "./outline.js";
+import { drawOverlay } from "./overlay.js";
 import { Photograph } from "./photograph.js";
 
 const DRAG_FROM = 3;
@@ -74,6 +74,8 @@ export class Stage {
     overlay.addEventListener("pointerup", (event) => this.pointerUp(event, false));
     overlay.addEventListener("pointercancel", (event) => this.pointerUp(event, true));
     overlay.addEventListener("pointerleave", () => this.leave());
+    // The middle button would begin to scroll.
+    overlay.addEventListener("mousedown", (event) => event.button === 1 && event.preventDefault());
     overlay.addEventListener("contextmenu", (event) => event.preventDefault());
     overlay.addEventListener("wheel", (event) => this.wheel(event), { passive: false });
     overlay.addEventListener("focus", () => {
@@ -150,7 +152,7 @@ export class Stage {
     this.setHover(0);
     this.photograph.check();
     this.app.server.moved();
-    this.app.rememberCamera();
+    this.app.look.remember();
     this.redraw();
   }
 
@@ -454,156 +456,12 @@ export class Stage {
     this.drawing = true;
     requestAnimationFrame(() => {
       this.drawing = false;
-      this.draw();
+      drawOverlay(this.app);
     });
-  }
-
-  draw() {
-    const g = this.overlay.getContext("2d");
-    if (!g) return;
-    const { store, camera } = this.app;
-    const pixels = this.overlay.width / Math.max(1, this.box.clientWidth);
-    g.setTransform(1, 0, 0, 1, 0, 0);
-    g.clearRect(0, 0, this.overlay.width, this.overlay.height);
-    g.lineJoin = "round";
-    g.lineCap = "round";
-    if (this.ids && store.hover) this.drawOutline(g, store.hover);
-    g.setTransform(pixels, 0, 0, pixels, 0, 0);
-    const turning = this.drag?.moved === true && !this.drag.tool;
-    if (turning || this.pivotShown > performance.now()) this.drawPivot(g);
-    const { hint } = store;
-    if (hint?.view && store.tool === "click" && this.app.views.here() === hint.view) {
-      const at = this.photograph.css(hint.view, hint);
-      if (at) ring(g, at.x, at.y, 9, this.app.accent);
-    }
-    this.tool.draw?.(g, this.ratio);
-    if (document.activeElement === this.overlay && !this.byPointer) {
-      const { x, y } = this.middle();
-      cross(g, x, y);
-    }
-    this.drawAxes(g, camera);
-  }
-
-  /** @param {CanvasRenderingContext2D} g @param {number} code */
-  drawOutline(g, code) {
-    if (!this.ids) return;
-    let path = this.outlines.get(code);
-    if (!path) {
-      path = outline(this.ids, code);
-      this.outlines.set(code, path);
-    }
-    const scale = this.overlay.width / this.ids.width;
-    const tall = this.overlay.height / this.ids.height;
-    g.setTransform(scale, 0, 0, tall, 0, 0);
-    const pixel = (devicePixelRatio || 1) / scale;
-    g.strokeStyle = "rgb(0 0 0 / 0.55)";
-    g.lineWidth = 4 * pixel;
-    g.stroke(path);
-    g.strokeStyle = "#ffffff";
-    g.lineWidth = 1.75 * pixel;
-    g.stroke(path);
-  }
-
-  /** @param {CanvasRenderingContext2D} g */
-  drawPivot(g) {
-    const at = this.css(this.app.camera.pivot);
-    if (at.depth <= 0 || this.movement === "fly") return;
-    ring(g, at.x, at.y, 4, "#ffffff");
-  }
-
-  /** The world's axes, small, in a corner. @param {CanvasRenderingContext2D} g
-   * @param {Camera} camera */
-  drawAxes(g, camera) {
-    const size = 20;
-    const at = { x: this.box.clientWidth - size - 18, y: size + 18 };
-    /** @type {{name: string, x: number, y: number, depth: number, colour: string}[]} */
-    const axes = [];
-    const world = /** @type {const} */ ([
-      ["X", [1, 0, 0], "#ff6b6b"],
-      ["Y", [0, 1, 0], "#5bd66f"],
-      ["Z", [0, 0, 1], "#6ea8ff"],
-    ]);
-    const here = camera.position;
-    for (const [name, axis, colour] of world) {
-      const local = sub(add(here, [axis[0], axis[1], axis[2]]), here);
-      const part = (/** @type {Vec3} */ v) => local[0] * v[0] + local[1] * v[1] + local[2] * v[2];
-      const [x, y] = [part(camera.right), part(camera.down)];
-      axes.push({ name, x: x * size, y: y * size, depth: part(camera.forward), colour });
-    }
-    g.save();
-    g.translate(at.x, at.y);
-    g.font = "600 9px system-ui, sans-serif";
-    g.textAlign = "center";
-    g.textBaseline = "middle";
-    g.fillStyle = "rgb(16 18 22 / 0.45)";
-    g.beginPath();
-    g.arc(0, 0, size + 10, 0, 7);
-    g.fill();
-    for (const axis of axes.sort((a, b) => b.depth - a.depth)) {
-      g.globalAlpha = axis.depth > 0.2 ? 0.55 : 1;
-      g.strokeStyle = axis.colour;
-      g.fillStyle = axis.colour;
-      g.lineWidth = 1.75;
-      g.beginPath();
-      g.moveTo(0, 0);
-      g.lineTo(axis.x * 0.8, axis.y * 0.8);
-      g.stroke();
-      g.fillText(axis.name, axis.x * 1.2, axis.y * 1.2);
-    }
-    g.restore();
   }
 }
 
 /** @param {number} value @returns {number} */
 function round(value) {
   return Math.round(value * 100) / 100;
-}
-
-/** @param {CanvasRenderingContext2D} g @param {number} x @param {number} y @param {number} size
- * @param {string} colour */
-export function ring(g, x, y, size, colour) {
-  g.beginPath();
-  g.arc(x, y, size, 0, 7);
-  g.strokeStyle = "rgb(0 0 0 / 0.6)";
-  g.lineWidth = 4;
-  g.stroke();
-  g.strokeStyle = colour;
-  g.lineWidth = 2;
-  g.stroke();
-}
-
-/** @param {CanvasRenderingContext2D} g @param {number} x @param {number} y */
-function cross(g, x, y) {
-  for (const [colour, width] of /** @type {const} */ ([["rgb(0 0 0 / 0.6)", 4], ["#fff", 1.5]])) {
-    g.strokeStyle = colour;
-    g.lineWidth = width;
-    g.beginPath();
-    g.moveTo(x - 9, y);
-    g.lineTo(x + 9, y);
-    g.moveTo(x, y - 9);
-    g.lineTo(x, y + 9);
-    g.stroke();
-  }
-}
-
-/**
- * A path of a tool: white over black, dashed where it is not yet sure.
- * @param {CanvasRenderingContext2D} g @param {Path2D} path @param {string} colour
- * @param {boolean} [filled]
- */
-export function sketch(g, path, colour, filled = true) {
-  if (filled) {
-    g.globalAlpha = 0.14;
-    g.fillStyle = colour;
-    g.fill(path);
-    g.globalAlpha = 1;
-  }
-  g.strokeStyle = "rgb(0 0 0 / 0.55)";
-  g.lineWidth = 3.5;
-  g.stroke(path);
-  g.strokeStyle = "#ffffff";
-  g.lineWidth = 1.5;
-  g.setLineDash([5, 4]);
-  g.stroke(path);
-  g.setLineDash([]);
 }

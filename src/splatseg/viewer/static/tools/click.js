@@ -28,7 +28,8 @@ export class ClickTool {
     const { current } = gestures;
     const refines = point.alt || this.points !== "new";
     const good = point.alt ? point.shift : this.points !== "less";
-    const same = gestures.here() && current?.prompt.kind === "click" && current.view === target.view;
+    const same =
+      gestures.here() && current?.prompt.kind === "click" && current.view === target.view;
     if (refines && same && current) {
       const { points = [], negative = [] } = current.prompt;
       this.marks.push({ x: point.x, y: point.y, good });

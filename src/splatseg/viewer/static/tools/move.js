@@ -232,7 +232,8 @@ export class MoveTool {
       path.moveTo(line[0].x, line[0].y);
       for (const { x, y } of line) path.lineTo(x, y);
       stroke(g, path, lit ? "#ffffff" : AXES[index].colour, lit ? 3.5 : 2.5);
-      if (this.kind === "translate") arrowHead(g, line[0], line[1], lit ? "#fff" : AXES[index].colour);
+      if (this.kind === "translate")
+        arrowHead(g, line[0], line[1], lit ? "#fff" : AXES[index].colour);
     }
     if (this.kind === "translate") {
       const lit = (this.grip?.axis ?? this.near) === FREE;
@@ -258,7 +259,9 @@ export class MoveTool {
     const { stage } = this.app;
     const half = (subject.radius * motion.scale) / Math.sqrt(3);
     const corners = Array.from({ length: 8 }, (_, index) => {
-      const corner = /** @type {Vec3} */ ([0, 1, 2].map((bit) => (index & (1 << bit) ? half : -half)));
+      const corner = /** @type {Vec3} */ (
+        [0, 1, 2].map((bit) => (index & (1 << bit) ? half : -half))
+      );
       const turned = rotate(motion.rotation, corner);
       return stage.css(add(add(subject.about, motion.translation), turned));
     });
@@ -297,9 +300,20 @@ function rotate([w, x, y, z], v) {
 
 /** Two directions across an axis. @param {Vec3} axis @returns {[Vec3, Vec3]} */
 function across(axis) {
-  if (axis[0]) return [[0, 1, 0], [0, 0, 1]];
-  if (axis[1]) return [[0, 0, 1], [1, 0, 0]];
-  return [[1, 0, 0], [0, 1, 0]];
+  if (axis[0])
+    return [
+      [0, 1, 0],
+      [0, 0, 1],
+    ];
+  if (axis[1])
+    return [
+      [0, 0, 1],
+      [1, 0, 0],
+    ];
+  return [
+    [1, 0, 0],
+    [0, 1, 0],
+  ];
 }
 
 /** @param {{x: number, y: number}} p @param {{x: number, y: number}} a

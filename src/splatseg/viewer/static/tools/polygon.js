@@ -1,6 +1,6 @@
 /** Polygon: corner by corner around a thing. */
 
-import { sketch } from "../stage/stage.js";
+import { sketch } from "../stage/overlay.js";
 
 /**
  * @typedef {import("../main.js").App} App

@@ -1,6 +1,6 @@
 /** Sphere: a ball around a point of the surface; the drag says how large. */
 
-import { sketch } from "../stage/stage.js";
+import { sketch } from "../stage/overlay.js";
 import { clamp } from "../dom.js";
 
 /**
@@ -15,7 +15,8 @@ const DRAGGED = 5;
 /** @implements {Tool} */
 export class SphereTool {
   cursor = "crosshair";
-  says = "Press on a surface and drag for the radius; a click takes the last one. [ and ] change it.";
+  says =
+    "Press on a surface and drag for the radius; a click takes the last one. [ and ] change it.";
 
   /** @param {App} app */
   constructor(app) {

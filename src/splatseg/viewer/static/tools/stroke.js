@@ -91,7 +91,10 @@ export class StrokeTool {
       g.globalAlpha = 1;
     }
     if (!this.at) return;
-    for (const [colour, width] of /** @type {const} */ ([["rgb(0 0 0 / .6)", 3], ["#fff", 1.5]])) {
+    for (const [colour, width] of /** @type {const} */ ([
+      ["rgb(0 0 0 / .6)", 3],
+      ["#fff", 1.5],
+    ])) {
       g.beginPath();
       g.arc(this.at.x, this.at.y, this.width / 2, 0, 7);
       g.strokeStyle = colour;
