@@ -215,7 +215,7 @@ export class App {
     if (message.stage !== "final") return;
     if (this.reverting) {
       this.reverting = false;
-      this.undo();
+      this.takeBack();
     }
     clearTimeout(this.hintTimer);
     this.hintTimer = setTimeout(() => {
@@ -273,13 +273,16 @@ export class App {
   revert(gesture) {
     if (gesture !== this.gestures.count) return;
     if (this.gestures.pending === gesture) this.reverting = true;
-    else if (gesture === this.gestures.done) this.undo();
+    else if (gesture === this.gestures.done) this.takeBack();
+  }
+
+  takeBack() {
+    this.gestures.forget();
+    if (this.send({ type: "undo" })) this.waiting += 1;
   }
 
   undo() {
-    if (this.store.undo === null) return;
-    this.gestures.forget();
-    if (this.send({ type: "undo" })) this.waiting += 1;
+    if (this.store.undo !== null) this.takeBack();
   }
 
   redo() {
