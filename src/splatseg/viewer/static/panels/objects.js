@@ -55,6 +55,15 @@ export class ObjectsPanel {
     });
     this.list.box.setAttribute("aria-multiselectable", "true");
     this.empty = el("div", { class: "empty" });
+    this.colour = el("input", {
+      type: "color",
+      class: "unseen",
+      tabindex: -1,
+      "aria-hidden": "true",
+    });
+    this.colour.addEventListener("change", () =>
+      app.command("set_colour", { ids: [...app.store.picked], colour: bytes(this.colour.value) }),
+    );
     this.actions = el("div", {
       class: "row-actions",
       role: "group",
@@ -72,7 +81,7 @@ export class ObjectsPanel {
       sort,
       this.showAll,
     );
-    section.append(head, this.list.box, this.empty, this.actions);
+    section.append(head, this.list.box, this.empty, this.actions, this.colour);
     app.store.on(["document"], () => this.show());
     app.store.on(["picked", "mode"], () => this.showPicked());
     this.show();
@@ -235,6 +244,14 @@ export class ObjectsPanel {
         key: "F2",
         disabled: picked.length !== 1,
         action: () => this.rename(ids[0]),
+      },
+      {
+        label: "Colour…",
+        icon: "colour",
+        action: () => {
+          this.colour.value = hex(picked[0].colour);
+          this.colour.showPicker();
+        },
       },
       { label: "Frame", icon: "frame", key: "F", action: () => app.look.frame(true) },
       {

@@ -49,6 +49,7 @@ export class SuggestionsPanel {
       this.offer,
       this.list.box,
     );
+    this.list.box.addEventListener("blur", () => app.stage.setHover(0));
     app.store.on(["document", "scene"], () => this.show());
     this.show();
   }
@@ -75,9 +76,7 @@ export class SuggestionsPanel {
           class: "quiet",
           text: "A click goes by colour, place and connected pieces until they are made.",
         }),
-        iconButton("spark", "Make masks", () => this.app.jobs.start("see", {}, "Making masks"), {
-          text: true,
-        }),
+        iconButton("spark", "Make masks", () => this.makeMasks(), { text: true }),
       );
     } else {
       this.offer.append(
@@ -87,6 +86,18 @@ export class SuggestionsPanel {
         }),
       );
     }
+  }
+
+  /** Masks of the photographs, a layer of them, its objects as suggestions: one after the other. */
+  makeMasks() {
+    const { jobs, store } = this.app;
+    const before = new Set(store.scene?.layers ?? []);
+    jobs.start("see", {}, "Making masks", () =>
+      jobs.start("associate", {}, "Joining masks to objects", () => {
+        const fresh = (store.scene?.layers ?? []).find((layer) => !before.has(layer));
+        if (fresh) jobs.start("suggest", { layer: fresh }, `Suggestions of ${fresh}`);
+      }),
+    );
   }
 
   /** @param {HTMLElement} button */
