@@ -268,7 +268,7 @@ export class ExportDialog {
         : "";
     };
     const name = value("export-name").trim();
-    const label = `${kind.label} ${name}`;
+    const label = `${kind.label} “${name}”`;
     if (kind.id === "save_layer") {
       app.jobs.start("save_layer", { name }, label);
     } else if (kind.id === "picture") {

@@ -161,6 +161,13 @@ export class SelectionBar {
     ]);
   }
 
+  /** What edits are of, without a selection. @returns {string} */
+  pickedText() {
+    const picked = this.app.store.pickedObjects();
+    if (picked.length === 0) return "Nothing selected";
+    return picked.length === 1 ? `${picked[0].name} picked` : `${picked.length} objects picked`;
+  }
+
   show() {
     const { store, gestures } = this.app;
     const { selection } = store.document;
@@ -169,11 +176,8 @@ export class SelectionBar {
     const busy = gestures.pending !== 0;
     this.bar.toggleAttribute("data-busy", busy);
     this.bar.toggleAttribute("data-empty", !shown);
-    this.count.textContent = shown
-      ? counted(shown.count, "Gaussian")
-      : busy
-        ? "Selecting…"
-        : "Nothing selected";
+    const none = busy ? "Selecting…" : this.pickedText();
+    this.count.textContent = shown ? counted(shown.count, "Gaussian") : none;
     this.sure.textContent = shown ? `${percent(shown.confidence)} sure` : "";
     this.sure.hidden = !shown;
     this.level.value = String(store.level);

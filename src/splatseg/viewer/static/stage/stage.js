@@ -350,7 +350,9 @@ export class Stage {
   wheel(event) {
     event.preventDefault();
     const lines = event.deltaMode === WheelEvent.DOM_DELTA_LINE ? 30 : 1;
-    const delta = clamp(event.deltaY * lines, -240, 240);
+    // Two fingers on a touch pad come as a wheel with Ctrl, in small steps.
+    const pinch = event.ctrlKey ? 5 : 1;
+    const delta = clamp(event.deltaY * lines * pinch, -240, 240);
     this.zoom(Math.exp(delta * WHEEL_SPEED), this.point(event));
   }
 
