@@ -44,6 +44,7 @@ test("the fragment holds a token, a view, or both in either order", () => {
   assert.deepEqual(readFragment("#abc&view=1,2"), { token: "abc", view: "1,2" });
   assert.deepEqual(readFragment("#view=1,2&abc"), { token: "abc", view: "1,2" });
   assert.deepEqual(readFragment(""), { token: null, view: null });
+  assert.deepEqual(readFragment("#other=1"), { token: null, view: null });
 });
 
 test("no key means two things", () => {
