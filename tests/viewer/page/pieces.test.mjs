@@ -38,6 +38,31 @@ test("what touches the border is closed there, and other ids are not outlined", 
   assert.equal(outline({ width: 2, height: 2, ids }, 3).lines.length, 0);
 });
 
+test("an outline is as long as the sides that differ, of any shape", () => {
+  const pictures = [
+    [".#..", "###.", ".#.."],
+    ["..##", "#..#", "####"],
+    ["#..#", ".##.", "#..#"],
+  ];
+  for (const rows of pictures) {
+    const [width, height] = [rows[0].length, rows.length];
+    const ids = Uint16Array.from(rows.join(""), (letter) => (letter === "#" ? 1 : 0));
+    const at = (x, y) => x >= 0 && y >= 0 && x < width && y < height && rows[y][x] === "#";
+    let sides = 0;
+    for (let y = 0; y <= height; y++) {
+      for (let x = 0; x <= width; x++) {
+        sides += Number(at(x, y) !== at(x - 1, y)) + Number(at(x, y) !== at(x, y - 1));
+      }
+    }
+    const { lines } = outline({ width, height, ids }, 1);
+    const length = lines.reduce((sum, line) => {
+      const [a, b, c, d] = line.split(" ").map(Number);
+      return sum + Math.abs(a - c) + Math.abs(b - d);
+    }, 0);
+    assert.equal(length, sides, rows.join("/"));
+  }
+});
+
 test("the fragment holds a token, a view, or both in either order", () => {
   assert.deepEqual(readFragment("#abc_-1"), { token: "abc_-1", view: null });
   assert.deepEqual(readFragment("#view=1,2"), { token: null, view: "1,2" });

@@ -9,14 +9,18 @@
  * @returns {Path2D}
  */
 export function outline(map, id) {
-  const { width, height, ids } = map;
   const path = new Path2D();
-  for (let y = 0; y <= height; y++) {
+  const box = bounds(map, id);
+  if (!box) return path;
+  const { width, ids } = map;
+  const { left, right, top, bottom } = box;
+  /** @param {number} x @param {number} y Inside the box, or one beside it. */
+  const has = (x, y) =>
+    x >= left && x <= right && y >= top && y <= bottom && ids[y * width + x] === id;
+  for (let y = top; y <= bottom + 1; y++) {
     let start = -1;
-    for (let x = 0; x <= width; x++) {
-      const above = y > 0 && x < width && ids[(y - 1) * width + x] === id;
-      const below = y < height && x < width && ids[y * width + x] === id;
-      if (above !== below) {
+    for (let x = left; x <= right + 1; x++) {
+      if (has(x, y - 1) !== has(x, y)) {
         if (start < 0) start = x;
       } else if (start >= 0) {
         path.moveTo(start, y);
@@ -25,12 +29,10 @@ export function outline(map, id) {
       }
     }
   }
-  for (let x = 0; x <= width; x++) {
+  for (let x = left; x <= right + 1; x++) {
     let start = -1;
-    for (let y = 0; y <= height; y++) {
-      const left = x > 0 && y < height && ids[y * width + x - 1] === id;
-      const here = x < width && y < height && ids[y * width + x] === id;
-      if (left !== here) {
+    for (let y = top; y <= bottom + 1; y++) {
+      if (has(x - 1, y) !== has(x, y)) {
         if (start < 0) start = y;
       } else if (start >= 0) {
         path.moveTo(x, start);
@@ -40,4 +42,27 @@ export function outline(map, id) {
     }
   }
   return path;
+}
+
+/**
+ * First and last columns and rows that hold an id.
+ * @param {IdMap} map
+ * @param {number} id
+ * @returns {{left: number, right: number, top: number, bottom: number}|null}
+ */
+function bounds({ width, ids }, id) {
+  const first = ids.indexOf(id);
+  if (first < 0) return null;
+  const top = Math.floor(first / width);
+  const bottom = Math.floor(ids.lastIndexOf(id) / width);
+  let left = width;
+  let right = -1;
+  for (let y = top; y <= bottom; y++) {
+    const row = ids.subarray(y * width, (y + 1) * width);
+    const from = row.indexOf(id);
+    if (from < 0) continue;
+    left = Math.min(left, from);
+    right = Math.max(right, row.lastIndexOf(id));
+  }
+  return { left, right, top, bottom };
 }
