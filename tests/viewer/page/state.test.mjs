@@ -107,6 +107,19 @@ test("without an order new objects come last and the others stay", () => {
   assert.equal(store.byId.get(1).visible, false);
 });
 
+test("a selection alone leaves the very same lists, so that no row is made again", () => {
+  const store = opened();
+  const { objects, suggestions } = store.document;
+  store.patch(patch({ selection: { count: 1, confidence: 1 } }));
+  assert.equal(store.document.objects, objects);
+  assert.equal(store.document.suggestions, suggestions);
+  store.patch(patch({ from: 5, to: 6, order: [3, 2, 1] }));
+  assert.deepEqual(
+    store.document.objects.map(({ id }) => id),
+    [3, 2, 1],
+  );
+});
+
 test("null leaves suggestions and edits, and ends the selection", () => {
   const store = opened();
   store.selected = { stage: "final" };

@@ -146,6 +146,7 @@ export class Store {
     const old = this.document;
     const gone = new Set(patch.gone ?? []);
     const fresh = new Map((patch.objects ?? []).map((object) => [object.id, object]));
+    const same = gone.size === 0 && fresh.size === 0;
     let objects = old.objects
       .filter((object) => !gone.has(object.id))
       .map((object) => fresh.get(object.id) ?? object);
@@ -165,7 +166,7 @@ export class Store {
     }
     this.setDocument({
       revision: patch.to,
-      objects,
+      objects: same && !patch.order ? old.objects : objects,
       selection,
       suggestions: patch.suggestions ?? old.suggestions,
       edits: patch.edits ?? old.edits,

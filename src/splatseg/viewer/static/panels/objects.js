@@ -22,6 +22,8 @@ export class ObjectsPanel {
     this.app = app;
     this.sort = "order";
     this.query = "";
+    /** What the rows were made of: others' selections do not make them again. @type {unknown[]} */
+    this.built = [];
     /** Row that the range of a Shift+click starts at. @type {number|null} */
     this.anchor = null;
     /** Object whose row is a text field now: rows are not rebuilt under it. @type {number|null} */
@@ -106,7 +108,10 @@ export class ObjectsPanel {
 
   show() {
     if (this.renaming !== null) return;
-    const { objects } = this.app.store.document;
+    const { objects, isolated } = this.app.store.document;
+    const key = [objects, isolated, this.query, this.sort];
+    if (key.every((part, index) => part === this.built[index])) return;
+    this.built = key;
     const shown = this.shown();
     this.count.textContent = objects.length > 0 ? number(objects.length) : "";
     this.list.set(shown);
@@ -458,6 +463,7 @@ export class ObjectsPanel {
       if (done) return;
       done = true;
       this.renaming = null;
+      this.built = [];
       const name = input.value.trim();
       this.show();
       if (take && name && name !== object.name) this.app.command("rename", { id, name });

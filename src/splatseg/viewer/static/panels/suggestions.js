@@ -60,7 +60,7 @@ export class SuggestionsPanel {
     const layers = store.scene?.layers ?? [];
     const bare = store.scene !== null && store.scene.source === null;
     this.count.textContent = suggestions.length > 0 ? number(suggestions.length) : "";
-    this.list.set(suggestions);
+    if (this.list.items !== suggestions) this.list.set(suggestions);
     this.list.box.hidden = suggestions.length === 0;
     this.acceptAll.hidden = suggestions.length === 0;
     this.rejectAll.hidden = suggestions.length === 0;
