@@ -86,7 +86,7 @@ function drawAxes({ stage, camera }, g) {
   g.font = "600 9px system-ui, sans-serif";
   g.textAlign = "center";
   g.textBaseline = "middle";
-  g.fillStyle = "rgb(16 18 22 / 0.45)";
+  g.fillStyle = "rgb(16 18 22 / 0.62)";
   g.beginPath();
   g.arc(0, 0, size + 10, 0, 7);
   g.fill();
