@@ -162,4 +162,6 @@ test("focal lengths are of the longer side", () => {
   made.focal = 0.9;
   [made.width, made.height] = [380, 800];
   assert.equal(made.record().focal, 720);
+  const { width, height, focal } = made.record(0.5);
+  assert.deepEqual([width, height, focal], [190, 400, 360]);
 });

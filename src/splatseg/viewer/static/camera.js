@@ -80,9 +80,11 @@ export class Camera {
     return [r[0], d[0], f[0], p[0], r[1], d[1], f[1], p[1], r[2], d[2], f[2], p[2], 0, 0, 0, 1];
   }
 
-  /** @returns {CameraRecord} What messages hold. */
-  record() {
-    return { width: this.width, height: this.height, focal: this.pixels, matrix: this.matrix() };
+  /** @param {number} [scale] Of the picture. @returns {CameraRecord} What messages hold. */
+  record(scale = 1) {
+    const width = Math.round(this.width * scale);
+    const height = Math.round(this.height * scale);
+    return { width, height, focal: this.pixels * scale, matrix: this.matrix() };
   }
 
   /**

@@ -302,8 +302,12 @@ export class App {
   setMove(kind) {
     this.tools.move.kind = kind;
     this.setTool("move");
-    if (!this.tools.move.subject()) {
+    const subject = this.tools.move.subject();
+    this.stage.setHover(0);
+    if (!subject) {
       this.toast("Nothing is selected to move.", "Select a thing or pick an object in the list.");
+    } else if (!this.stage.sees(subject.about)) {
+      this.toast("The middle of the selection is out of view.", "F frames it, with its handles.");
     }
   }
 

@@ -56,12 +56,14 @@ export class ServerStage {
       this.wanted = true;
       return;
     }
-    const { store, camera } = this.app;
+    const { store, camera, stage } = this.app;
+    // What moves is drawn in CSS pixels: four times as many on a fine screen would be for nobody.
+    const scale = rest ? 1 : 1 / stage.ratio;
     const id = this.id + 1;
     const sent = this.app.send({
       type: "camera",
       id,
-      ...camera.record(),
+      ...camera.record(scale),
       mode: store.mode,
       only: store.only,
       rest,

@@ -216,6 +216,13 @@ export class Stage {
     return { x: x / this.ratio, y: y / this.ratio, depth };
   }
 
+  /** Whether a world point lies in the picture. @param {Vec3} point @returns {boolean} */
+  sees(point) {
+    const { x, y, depth } = this.css(point);
+    const { clientWidth: width, clientHeight: height } = this.box;
+    return depth > 0 && x >= 0 && y >= 0 && x <= width && y <= height;
+  }
+
   /** @param {PointerEvent} event */
   pointerDown(event) {
     this.byPointer = true;
@@ -420,7 +427,8 @@ export class Stage {
 
   /** What the id map has at a point: no message. @param {Point|null} point */
   hoverAt(point) {
-    if (!point || point.touch || this.drag || !this.ids) {
+    const busy = this.drag !== null || this.app.store.tool === "move";
+    if (!point || point.touch || busy || !this.ids) {
       this.setHover(0);
       return;
     }
