@@ -16,7 +16,7 @@ NATIVE_SOURCES := CMakeLists.txt $(wildcard native/*)
 .PHONY: help install demo test clean
 
 help:
-	@echo 'make demo     the main job on a generated room; the report is splatseg-demo/report.html'
+	@echo 'make demo     the main job on a generated room; reports are in splatseg-demo/scene/reports'
 	@echo 'make test     lint, types, import rules and every test'
 	@echo 'make install  only make .venv and install everything into it'
 	@echo 'make clean    remove .venv and everything that was built'

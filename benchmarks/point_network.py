@@ -86,8 +86,8 @@ def measure(count: int, threads: int, repeats: int, *, with_plain: bool) -> None
         row(f"level {level}", best(lambda b=block, g=given: b(*g), repeats))
         if with_plain and level == 0:
             row("plain 0", best(lambda b=block, g=given: plain(b, *g), 1))
-        found, variant = block(*given), encoder.config.variant
-        features = sample(found, pyramid.neighbours[level], pyramid.pool[level], variant=variant)
+        found = block(*given)
+        features = sample(found, pyramid.neighbours[level], pyramid.pool[level])
 
 
 def main() -> None:

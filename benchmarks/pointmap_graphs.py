@@ -4,8 +4,8 @@
     python benchmarks/pointmap_graphs.py ../shared/data/office --views 100 --many
 
 Pointmaps are those of `pointmaps.py`, with 10 % of outlier pairs. Without further options every
-pair is recorded and each graph chooses among them: complete, window, one reference, retrieval, with
-the default alignment and the published one. ``--many`` records pairs up to 4 apart by name, aligns
+pair is recorded and each graph chooses among them: complete, window, one reference, retrieval.
+``--many`` records pairs up to 4 apart by name, aligns
 those up to 1, 2 and 4 apart in blocks of 50, and the last in blocks of 25, all at once, and without
 refinement.
 Every row is a process of its own, so that its seconds and its peak of memory are its own; the first
@@ -69,7 +69,7 @@ def rows(many: bool) -> list[dict[str, Any]]:
     """What is changed of the options in each row."""
     if not many:
         graphs: list[dict[str, Any]] = [{"pairs": graph} for graph in GRAPHS]
-        return [{NOTHING: True}, *graphs, *({**one, "alignment": "published"} for one in graphs)]
+        return [{NOTHING: True}, *graphs]
     window = {"pairs": "window"}
     windows = [{**window, "window": reach} for reach in WINDOWS]
     # In blocks of 50 without a word on it.

@@ -10,7 +10,7 @@ fifth of the maps and 10 % of outlier pairs (`PointmapErrors`). Cameras are move
 ones by the best similarity of their centres; those count in % of the diagonal of the box around
 them. A few centres tell badly how the whole world is turned, so the rotation between two cameras
 is compared too, of all pairs of them, which needs no similarity. ``--all`` aligns without
-refinement and as published as well; ``--sfm`` runs structure from motion on the same photographs
+refinement as well; ``--sfm`` runs structure from motion on the same photographs
 first; ``--record`` writes photographs and pointmaps for ``splatseg fit ROOM/photos --poses
 pointmaps``. Fails where a camera is beyond 0.5 degrees or 1 %, or a focal length beyond 1 %.
 """
@@ -41,7 +41,6 @@ GOALS = {"rotation max deg": 0.5, "centre max % of extent": 1.0, "focal off": 0.
 KINDS = {
     "default": PointmapOptions(),
     "not refined": PointmapOptions(refine=False),
-    "published": PointmapOptions(alignment="published"),
 }
 
 

@@ -21,7 +21,7 @@ from scored import ScoredScene
 
 from splatseg.core import Labels, Scene
 from splatseg.io.scene import load_scene
-from splatseg.models import SeenEvidence
+from splatseg.models import DescribedEvidence
 from splatseg.tasks import ImportOptions, SegmentOptions, import_scene, see, segment
 from splatseg.tasks.import_scene import UpAxis
 
@@ -34,7 +34,7 @@ class Row:
     """One way of getting evidence, and what came of it."""
 
     title: str
-    seen: SeenEvidence
+    seen: DescribedEvidence
     seconds: float
     score: dict[str, float]
 

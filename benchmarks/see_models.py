@@ -40,7 +40,7 @@ ROOT = Path(__file__).resolve().parent.parent
 WIDTH, HEIGHT = 256, 192
 SEEDS = "seeds"
 COLUMNS = ("model", "what", "images", "s", "s CPU", "s/image", "peak MB", "peak MB of a tenth",
-           "evidence MB", "cache MB", "or why not")  # fmt: skip
+           "evidence MB", "or why not")  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,9 +53,6 @@ class Run:
 
     flags: tuple[str, ...] = ()
 
-    cached: bool = True
-    """Whether its answers are of single photographs, which a cache can keep."""
-
 
 _GRID = ("--points-per-side", "8")
 _WORDS = ("--words", "wall", "box")
@@ -67,8 +64,8 @@ RUNS = (
     Run(model="sam-hq", kind="sam_hq", flags=_GRID),
     Run(model="sam2", kind="sam2", flags=_GRID),
     Run(model="sam3", kind="sam3_whole", flags=_GRID),
-    Run(model="sam2-video", kind="sam2_video", flags=_FOLLOWED, cached=False),
-    Run(model="sam3-video", kind="sam3_whole", flags=_FOLLOWED, cached=False),
+    Run(model="sam2-video", kind="sam2_video", flags=_FOLLOWED),
+    Run(model="sam3-video", kind="sam3_whole", flags=_FOLLOWED),
     Run(model="dino", kind="dino"),
     Run(model="dinov2", kind="dinov2"),
     Run(model="dinov3", kind="dinov3"),
@@ -202,8 +199,6 @@ def measured(run: Run, work: Path, scene: Path, checkpoints: Checkpoints, count:
         words += [flag.format_map(checkpoints) for flag in run.flags]
         if run.kind:
             words += ["--weights", str(checkpoints[run.kind]), "--device", "cpu"]
-        if run.cached and name == "all":
-            words += ["--cache", str(work / "caches" / run.model)]
         output = work / f"{run.model}-{name}.txt"
         with output.open("w") as file:
             status = subprocess.run(words, stdout=file, stderr=subprocess.STDOUT).returncode
@@ -215,7 +210,7 @@ def measured(run: Run, work: Path, scene: Path, checkpoints: Checkpoints, count:
     row[1] = told["kind"]
     row += [f"{took['wall']:.1f}", f"{took['cpu']:.1f}", f"{told['seconds'] / count:.3f}",
             f"{peaks[1]:.0f}", f"{peaks[0]:.0f}", megabytes(Path(told["evidence"])),
-            megabytes(work / "caches" / run.model), ""]  # fmt: skip
+            ""]  # fmt: skip
     return row
 
 
@@ -247,7 +242,6 @@ def main() -> None:
     print(f"| {' | '.join('---' for _ in COLUMNS)} |", flush=True)
     with tempfile.TemporaryDirectory() as name:
         work = Path(name)
-        (work / "caches").mkdir()
         scene = write_scene(work / "capture", arguments.images)
         checkpoints = Checkpoints(work / "checkpoints")
         for run in runs:

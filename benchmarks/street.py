@@ -60,7 +60,7 @@ from splatseg.io.captures import read_capture
 from splatseg.io.scans import read_scans
 from splatseg.io.scene import load_scene
 from splatseg.lift import GaussianField, PointLabelOptions
-from splatseg.lift.viewed_points import ViewedPointOptions, ViewedPoints, points_in_sight
+from splatseg.lift.viewed_points import ViewedPointOptions, ViewedPoints, points_in_view
 from splatseg.methods import find_method
 from splatseg.neighbours import NeighbourIndex
 from splatseg.street.field import MeshField
@@ -146,7 +146,7 @@ class Bench:
         if learned is not None:
             views = tuple(view for view in views if view.name in set(learned))
         depths = ((view.camera, self._true_depth(view)) for view in views)
-        return points_in_sight(self.scans[0], depths).numpy()
+        return points_in_view(self.scans[0], depths).numpy()
 
     def _true_depth(self, view: View) -> Tensor:
         """z-depth of the nearest of every second pixel, metres."""

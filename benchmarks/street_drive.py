@@ -38,7 +38,7 @@ from torch import Tensor
 from splatseg.core import Camera, Capture, LabelledMesh, LayerInfo, Scan, View
 from splatseg.io.evidence import open_evidence
 from splatseg.raycast import RayCaster
-from splatseg.street.block_field import DriveField, DriveScans, block_capture
+from splatseg.street.block_field import DriveField, DriveScans, block_views
 from splatseg.street.blocks import (
     DriveBlock,
     DriveBlockOptions,
@@ -246,21 +246,22 @@ class Maker:
         self.live: weakref.WeakSet[MeshField] = weakref.WeakSet()
 
     def __call__(self, block: DriveBlock) -> MeshField:
-        part = block_capture(self.capture, self.drive, block)
+        own_views = block_views(self.capture.views, self.drive, block)
+        views = [view for view in own_views if view.split == "train"]
         own = self.scans.of(block)
         start = voxel_primitives(
             scan_points(own, 0.25), shapes=self.shapes, sizes=(VOXEL,), sphere=self.sphere
         )
-        cameras: Sequence[Camera] = [view.camera for view in part.train_views]
+        cameras: Sequence[Camera] = [view.camera for view in views]
         fitted = fit_geometry(start, self.shapes, scan_views(own, cameras), options=GEOMETRY)
         mesh = fitted.primitives.mesh(self.shapes)
         with tempfile.TemporaryDirectory() as folder:
-            for view in part.train_views:
+            for view in views:
                 ids = self.recorder.classes(view).clamp_min(0).numpy().astype(np.uint8)
                 Image.fromarray(ids).save(Path(folder) / f"{view.name}.png")
             trained = train_radiance(
                 mesh,
-                part.train_views,
+                views,
                 open_evidence(folder),
                 ids=[row.id for row in STREET_CLASSES.rows],
                 options=RADIANCE,

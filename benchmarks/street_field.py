@@ -36,7 +36,7 @@ from splatseg.io.captures import read_capture
 from splatseg.io.evidence import open_evidence
 from splatseg.io.scans import read_scans
 from splatseg.io.scene import load_scene
-from splatseg.street.build import DnmpOptions, seen_shares
+from splatseg.street.build import DnmpOptions, visible_shares
 from splatseg.street.field import MeshField
 from splatseg.street.files import save_mesh_field
 from splatseg.street.geometry import fit_geometry
@@ -206,7 +206,7 @@ def main() -> None:
         if args.json is not None:
             args.json.write_text(json.dumps({"options": args.set, "rows": rows}, indent=1))
         if args.save is not None:
-            save_mesh_field(MeshField(mesh, fit.model, seen=seen_shares(fit.seen)), args.save)
+            save_mesh_field(MeshField(mesh, fit.model, seen=visible_shares(fit.seen)), args.save)
 
 
 if __name__ == "__main__":

@@ -101,7 +101,7 @@ class Bench:
             torch.from_numpy(classes.ravel()),
         )
 
-    def seen_by(self, primitives: Primitives) -> Iterator[Tensor]:
+    def visible_in(self, primitives: Primitives) -> Iterator[Tensor]:
         """z-depth of first hits of each test view, 0 none."""
         caster = PrimitiveCaster(primitives.mesh(self.shapes))
         for view in self.test:
@@ -180,7 +180,7 @@ def main() -> None:
     counts = torch.bincount(primitives.levels).tolist()
     print(f"primitives by level: {counts}")
     print("row           median  ratio    mean  missing  CPU s     median by class, metres")
-    start = score(bench, list(bench.seen_by(primitives)))
+    start = score(bench, list(bench.visible_in(primitives)))
     say("start", start, start["median"], time.process_time() - begun)
     gaussians = None
     if arguments.scene is not None:
@@ -192,7 +192,7 @@ def main() -> None:
         begun = time.process_time()
         fit = fit_geometry(primitives, bench.shapes, depths, options=ROWS[name])
         seconds = time.process_time() - begun
-        seen = list(bench.seen_by(fit.primitives))
+        seen = list(bench.visible_in(fit.primitives))
         say(name, score(bench, seen), start["median"], seconds)
         if gaussians is not None and name == "default":
             say("  both see", score(bench, seen, gaussians), start["median"], 0)

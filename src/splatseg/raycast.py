@@ -1,7 +1,6 @@
 """Where rays meet triangles first: Embree's search, and the point of a known triangle."""
 
 import contextlib
-import importlib
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -13,7 +12,7 @@ from torch import Tensor
 
 from splatseg._check import check_finite, check_shape
 from splatseg.core.boundary import boundary
-from splatseg.errors import InputError, MissingPackageError, RangeError, ShapeError
+from splatseg.errors import InputError, RangeError, ShapeError, import_package
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -119,8 +118,6 @@ class RayCaster:
 
     @boundary
     def __init__(self, vertices: Float[Tensor, "n 3"], faces: Int[Tensor, "m 3"]) -> None:
-        check_shape("vertices", vertices, (None, 3))
-        check_shape("faces", faces, (None, 3))
         check_finite("vertices", vertices)
         if not len(faces):
             raise InputError("faces: expected at least one triangle, got none.")
@@ -151,7 +148,6 @@ class RayCaster:
             ShapeError: If there is not one origin, or as many as directions.
             RangeError: If a value is not finite, or a direction is 0.
         """
-        check_shape("directions", directions, (None, 3))
         check_shape("origins", origins, (3,) if origins.ndim < 2 else (len(directions), 3))
         check_finite("origins", origins)
         check_finite("directions", directions)
@@ -197,14 +193,8 @@ def _rough_weights(found: Any, hit: Tensor) -> Tensor:
 
 
 def _scene(vertices: Tensor, faces: Tensor) -> Any:
-    try:
-        scenes = importlib.import_module("embreex.rtcore_scene")
-        meshes = importlib.import_module("embreex.mesh_construction")
-    except ImportError as error:
-        raise MissingPackageError(
-            "casting rays at meshes needs a package that is not installed (embreex). "
-            "Try: pip install 'splatseg[mesh]'."
-        ) from error
+    scenes = import_package("embreex.rtcore_scene", "casting rays at meshes", "mesh")
+    meshes = import_package("embreex.mesh_construction", "casting rays at meshes", "mesh")
     scene = scenes.EmbreeScene(robust=True)
     # The corners of each triangle beside each other: indices of Embree have 32 bits.
     corners = vertices.float()[faces].contiguous().numpy()

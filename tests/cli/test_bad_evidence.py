@@ -1,4 +1,4 @@
-"""Evidence, caches and layers that are not what they should be, as the shell meets them.
+"""Evidence and layers that are not what they should be, as the shell meets them.
 
 Whatever is wrong costs one sentence that says what was expected and what came, exit status 2, and
 leaves the scene as it was.
@@ -388,7 +388,7 @@ def test_tracks(refused, tracked, tracks, words) -> None:
     assert words in sentence
 
 
-# Features, caches and what was stopped
+# Features and what was stopped
 
 
 def test_features_that_are_nan(small, splatseg, refused) -> None:
@@ -408,33 +408,6 @@ def test_features_that_are_nan(small, splatseg, refused) -> None:
     assert f"{folder / 'train_1.npz'}: expected an npz" in err
     sentence = refused("segment", "--method", "uplift", "--evidence", folder.name)
     assert "takes evidence of labels or tracked" in sentence
-
-
-def test_a_half_written_cache(small, splatseg, tmp_path) -> None:
-    cache = tmp_path / "cache"
-    command = ("see", small.scene, "--model", "classical", "--cache", cache)
-    assert splatseg(*command, "--evidence", "first")[0] == 0
-    entries = sorted(cache.rglob("*.entry"))
-    whole = [entry.read_bytes() for entry in entries]
-    assert len(entries) == 3
-    halved(entries[0])
-    entries[1].write_bytes(b"")
-    status, _, err = splatseg(*command, "--evidence", "second")
-    assert status == 0
-    assert f"{entries[0]}: it is half-written or damaged; the entry is computed again." in err
-    assert f"{entries[1]}: expected an entry of a cache of models" in err
-    assert str(entries[2]) not in err
-    assert [entry.read_bytes() for entry in entries] == whole
-    first, second = (small.scene / "evidence" / name for name in ("first", "second"))
-    for name in TRAIN:
-        assert (first / f"{name}.json").read_bytes() == (second / f"{name}.json").read_bytes()
-
-
-def test_a_cache_that_cannot_be_written(refused, splatseg, small, tmp_path) -> None:
-    (tmp_path / "file").write_text("x")
-    see = ("--model", "classical", "--evidence", "m", "--cache")
-    assert "expected a folder for the cache, got a file" in refused("see", *see, tmp_path / "file")
-    assert "in a folder that is there" in refused("see", *see, tmp_path / "no" / "cache")
 
 
 def test_evidence_that_was_stopped(small, splatseg, refused) -> None:

@@ -131,7 +131,7 @@ def test_the_applied_transform_is_named(broken, splatseg) -> None:
     ("words", "sentence"),
     [
         (["--max-views", "1"], "--max-views: expected at least 2, got 1"),
-        (["--fix", "full"], "full: expected a new or empty folder to write to"),
+        (["--fix", "full"], "full: expected a new folder, got one that is there"),
         (["--fix", "no/out"], "no/out: expected a place in a folder that is there"),
     ],
 )

@@ -15,7 +15,7 @@ import tyro
 
 from splatseg.cli import COMMANDS
 from splatseg.cli._parse import flowing, parse
-from splatseg.cli._words import FOLDER, kept_page, listed, option_value, with_flags, wrapped
+from splatseg.cli._words import FOLDER, listed, option_value, stored_page, with_flags, wrapped
 from splatseg.core.options import options
 from splatseg.errors import InputError
 
@@ -57,14 +57,14 @@ def test_help_imports_no_torch() -> None:
 
 
 def test_only_questions_for_help_are_answered_by_a_page() -> None:
-    assert kept_page("segment", []) is None
-    assert kept_page("segment", ["S", "--method", "vote"]) is None
-    assert kept_page("segment", ["S", "--help"]) is None
-    assert kept_page("segment", ["--method", "no-such", "--help"]) is None
-    assert kept_page("segment", ["--method", "../pages/segment-vote", "--help"]) is None
+    assert stored_page("segment", []) is None
+    assert stored_page("segment", ["S", "--method", "vote"]) is None
+    assert stored_page("segment", ["S", "--help"]) is None
+    assert stored_page("segment", ["--method", "no-such", "--help"]) is None
+    assert stored_page("segment", ["--method", "../pages/segment-vote", "--help"]) is None
     page = (FOLDER / "segment-vote.txt").read_text(encoding="utf-8")
-    assert kept_page("segment", ["--method", "vote", "--help"]) == page
-    assert kept_page("segment", ["--help", "--method=vote"]) == page
+    assert stored_page("segment", ["--method", "vote", "--help"]) == page
+    assert stored_page("segment", ["--help", "--method=vote"]) == page
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,5 +1,7 @@
 """Methods by name: help, refusals, and the ten lines of docs/methods.md, outside and inside."""
 
+import shutil
+import subprocess
 import sys
 import types
 from importlib.metadata import EntryPoint
@@ -10,7 +12,7 @@ import torch
 
 import splatseg as package
 from splatseg.core import Labels, LayerInfo, with_info
-from splatseg.errors import FileFormatError, InputError, MissingPackageError
+from splatseg.errors import InputError, MissingPackageError
 from splatseg.io.evidence import open_evidence
 from splatseg.io.scene import load_scene, load_scene_layer
 from splatseg.methods import (
@@ -22,8 +24,6 @@ from splatseg.methods import (
     keeps_ids,
     method_names,
     methods,
-    methods_table,
-    with_table,
 )
 from support.packages import blocks, install, run
 
@@ -253,15 +253,21 @@ def test_a_method_must_have_options_with_defaults() -> None:
             Method(options=options, **about)
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/methods.md"])
-def test_the_table_of_methods_is_what_they_declare(page) -> None:
-    text = (ROOT / page).read_text(encoding="utf-8")
-    assert with_table(text, methods_table(methods())) == text, "run scripts/methods_table"
-
-
-def test_a_page_without_marks_is_refused() -> None:
-    with pytest.raises(FileFormatError, match="expected the marks"):
-        with_table("no marks", "table")
+def test_the_table_of_methods_is_what_they_declare(tmp_path) -> None:
+    (tmp_path / "scripts").mkdir()
+    (tmp_path / "docs").mkdir()
+    script = shutil.copy(ROOT / "scripts" / "methods_table", tmp_path / "scripts")
+    pages = ("README.md", "docs/methods.md")
+    for page in pages:
+        shutil.copy(ROOT / page, tmp_path / page)
+    subprocess.run([sys.executable, script], check=True)
+    for page in pages:
+        made = (tmp_path / page).read_text()
+        assert made == (ROOT / page).read_text(), "run scripts/methods_table"
+    (tmp_path / "README.md").write_text("no marks")
+    done = subprocess.run([sys.executable, script], check=False, capture_output=True, text=True)
+    assert "README.md: expected the marks" in done.stderr
+    assert done.returncode == 1
 
 
 def test_a_method_that_went_says_what_to_use_and_its_layers_keep_their_ids() -> None:

@@ -67,10 +67,14 @@ def test_what_was_there_before_is_no_speed(clock: Clock, lines: list[str]) -> No
 def test_words_and_estimates_of_the_work_itself(clock: Clock, lines: list[str]) -> None:
     shown = ProgressLines("fit", write=lines.append, clock=clock)
     clock.now += 65
-    shown.show(0.25, 1.0, text="step 70", seconds_left=130)
-    assert lines == ["fit: step 70, 25 %, 1:05 elapsed, about 2:10 left\n"]
+    shown.show(0, 100)
+    lines.clear()
     clock.now += 65
-    shown.show(7, None)
+    shown.show(50, 100, "step 70")
+    assert lines == ["fit: step 70, 50 %, 2:10 elapsed, about 2:10 left\n"]
+    shown = ProgressLines("fit", write=lines.append, clock=clock)
+    clock.now += 130
+    shown.show(7, 0)
     assert lines[1] == "fit: 7, 2:10 elapsed\n"
 
 

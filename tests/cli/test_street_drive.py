@@ -192,9 +192,9 @@ def test_what_is_wrong_is_one_sentence(made, generated_drive, boxes, splatseg, t
     ):
         status, _, err = splatseg(*command)
         assert (status, err.count("\n")) == (2, 1), err
-        assert "drive.json: overlap: expected a finite number" in err
+        assert "drive.json: expected a field overlap, got none." in err
     assert not (tmp_path / "views").exists()
     assert not (tmp_path / "out").exists()
     status, out, _ = splatseg("info", root)
     assert status == 0
-    assert "drive.json: overlap: expected a finite number" in out
+    assert "drive.json: expected a field overlap, got none" in out

@@ -76,8 +76,10 @@ def test_mask_sets_keep_scores_and_sizes_in_step() -> None:
     made = MaskSet.from_dense(masks, scores=[0.5, 0.9], levels=[1, 0])
     assert torch.equal(made.dense(1), masks[1])
     assert made.scores.tolist() == pytest.approx([0.5, 0.9])
-    with pytest.raises(ShapeError, match="scores"):
+    with pytest.raises(ShapeError, match=r"levels: expected shape \(1\), got \(2,\)"):
         MaskSet.from_dense(masks, scores=[0.5])
+    with pytest.raises(ShapeError, match=r"scores: expected shape \(2\), got \(1,\)"):
+        MaskSet.from_dense(masks, scores=[0.5], levels=[1])
     with pytest.raises(ShapeError, match=r"masks\[0\]: expected 4 x 6 pixels, got 4 x 5"):
         MaskSet(height=4, width=6, masks=made.masks, scores=made.scores, levels=made.levels)
 

@@ -1,19 +1,15 @@
 """Colours of ids, depth and errors; sheets of images."""
 
 import numpy as np
-import pytest
 import torch
 
 from splatseg.core import ClassInfo, ClassTable
-from splatseg.errors import InputError
+from splatseg.report.colours import colour_of
 from splatseg.report.images import (
-    Gallery,
     GalleryImage,
     colour_depth,
     colour_labels,
-    colour_of,
     colour_share,
-    contact_sheet,
     mark_errors,
     overlay_labels,
 )
@@ -72,53 +68,6 @@ def test_errors_are_red_missing_ones_blue_and_void_is_left_alone():
     assert right == void == [125, 125, 125]
     assert wrong[0] > wrong[2] + 80
     assert missing[2] > missing[0] + 80
-
-
-def test_a_sheet_shows_each_picture_in_its_place():
-    red, green = plain((250, 0, 0), kind="chart"), plain((0, 250, 0), caption="g", kind="chart")
-    gallery = Gallery(
-        title="T", columns=("left", "right"), rows=(("one", (red, green)), ("two", (green, red)))
-    )
-    sheet = contact_sheet(gallery, cell_width=80).int()
-    assert sheet.shape[1] == 2 * 20 + 2 * 80 + 6
-    reds = ((sheet[..., 0] == 250) & (sheet[..., 1] == 0)).nonzero().float()
-    greens = ((sheet[..., 1] == 250) & (sheet[..., 0] == 0)).nonzero().float()
-    assert len(reds) == len(greens) == 2 * 80 * 60
-    upper = reds[reds[:, 0] < sheet.shape[0] / 2 + 20]
-    assert float(upper[:, 1].max()) == 20 + 80 - 1
-    assert float(upper[:, 1].min()) == 20
-    # Words are drawn: the title's ink on paper.
-    assert int(sheet[:50].amin()) < 100
-
-
-def test_a_longer_subtitle_makes_room_and_long_labels_are_cut():
-    gallery = Gallery(title="T", columns=("c",), rows=(("long " * 40, (plain((9, 9, 9)),)),))
-    low = contact_sheet(gallery, cell_width=60)
-    high = contact_sheet(gallery, cell_width=60, subtitle="words")
-    assert high.shape[0] == low.shape[0] + 24
-    # Nothing is written into the margin on the right.
-    assert int(low[:, -20:].amin()) > 200
-
-
-def test_the_legend_shows_every_colour_and_wraps():
-    rows = tuple(ClassInfo(id=i, name=f"class {i}", colour=(0, 250, i)) for i in range(1, 13))
-    table = ClassTable(rows=rows)
-    gallery = Gallery(title="T", columns=("c",), rows=(("v", (plain((9, 9, 9)),)),))
-    bare = contact_sheet(gallery, cell_width=260)
-    sheet = contact_sheet(gallery, cell_width=260, classes=table).int()
-    assert torch.equal(sheet[: bare.shape[0] - 20], bare[:-20].int())
-    lines = set()
-    for row in rows:
-        place = (sheet == torch.tensor(row.colour)).all(dim=-1).nonzero()
-        assert len(place) == 144
-        lines.add(int(place[0, 0]))
-    assert len(lines) >= 2
-    assert int(sheet[:, -20:].amin()) > 200
-
-
-def test_an_empty_sheet_is_refused():
-    with pytest.raises(InputError, match="at least one row"):
-        contact_sheet(Gallery(title="T", columns=("c",), rows=()))
 
 
 def test_labels_tint_a_photograph() -> None:

@@ -190,8 +190,8 @@ def test_columns_of_numbers_stand_right():
 @pytest.mark.parametrize(
     ("make", "said"),
     [
-        (lambda p: GalleryImage(image=p.image.float()), "uint8"),
-        (lambda p: GalleryImage(image=p.image[0]), "shape"),
+        (lambda p: GalleryImage(image=p.image.float()), "8 bit values"),
+        (lambda p: GalleryImage(image=p.image[0, 0]), r"expected an image \(height, width, 3\)"),
     ],
 )
 def test_what_does_not_fit_is_refused(make, said, photo):

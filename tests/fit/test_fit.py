@@ -260,7 +260,7 @@ def test_a_random_background_leaves_no_holes_in_black(capture: Capture) -> None:
 
 def test_the_background_is_named() -> None:
     for wrong in ("blue", "#12345", "#12345g", "", (0.1, 0.2), (0.0, 0.0, 1.1), [0.0, 0.0, -1.0]):
-        told = "background: expected (random, black, white, #rrggbb|text or a tuple)"
+        told = "background: expected (random, black, white, #rrggbb|text or a tuple|3 values)"
         with pytest.raises(InputError, match=told):
             replace(OPTIONS, background=wrong)
     for right in ("white", "#00FF7f", (0.1, 0.2, 1), [0.0, 0.0, 0.0]):

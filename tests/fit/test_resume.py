@@ -2,6 +2,7 @@
 
 import os
 import signal
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -145,7 +146,7 @@ def test_seconds_between_checkpoints_grow_with_what_they_cost(path: Path, monkey
     from splatseg.fit._checkpoint import FitState
 
     now = [100.0]
-    monkeypatch.setattr(_checkpoint.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
 
     def slow(*_: object) -> None:
         now[0] += 2.0

@@ -8,7 +8,7 @@ import torch
 
 from splatseg.core import Features, LayerInfo
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.lift.affinity import AffinityHead, project_features, projector_start, scale_rank
+from splatseg.lift.affinity import AffinityHead, project_features, projector_start
 from splatseg.lift.label_maps import ClassifierHead, has_classifier
 
 
@@ -42,20 +42,11 @@ def test_the_gate_closes_channels_by_scale() -> None:
     assert head().directions(torch.zeros(2), 0.0).tolist() == [0, 0]
 
 
-def test_scales_of_granularities_and_lengths() -> None:
+def test_scales_of_granularities() -> None:
     assert [head().scale(g) for g in (0.0, 0.25, 0.5, 1.0)] == pytest.approx([0.9, 0.7, 0.5, 0.2])
-    assert [head().scale_of(x) for x in (0.5, 1.0, 2.5, 3.0, 9)] == pytest.approx(
-        [0, 0, 0.75, 1, 1]
-    )
-    # Of equal quantiles the last counts.
-    quantiles = torch.tensor([1.0, 2.0, 2.0, 2.0, 4.0], dtype=torch.float64)
-    assert scale_rank(quantiles, 2.0) == pytest.approx(0.75)
-    assert scale_rank(quantiles, 3.0) == pytest.approx(0.875)
-    for call in (lambda: head().scale(1.5), lambda: head().gate(-0.1), lambda: head().scale_of(-1)):
+    for call in (lambda: head().scale(1.5), lambda: head().gate(-0.1)):
         with pytest.raises(RangeError, match="expected"):
             call()
-    with pytest.raises(InputError, match="measured scales"):
-        head(scale_quantiles=None).scale_of(1.0)
 
 
 def test_the_projector_is_equation_4(rng) -> None:
@@ -114,7 +105,7 @@ def test_heads_of_other_kinds_are_refused() -> None:
     [
         ({"channels": 0}, RangeError, "channels: expected at least 1"),
         ({"gate_bias": None}, InputError, "expected both or none"),
-        ({"gate_weight": torch.zeros(3)}, ShapeError, "gate_weight"),
+        ({"gate_weight": torch.zeros(3)}, ShapeError, r"gate_bias: expected shape \(3\), got"),
         ({"scale_quantiles": torch.zeros(5, dtype=torch.float64)}, ShapeError, "scale_quantiles"),
         (
             {"scale_quantiles": torch.linspace(1, 0, 101, dtype=torch.float64)},

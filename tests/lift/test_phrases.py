@@ -10,15 +10,15 @@ from splatseg.io.evidence import TextEmbeddings
 from splatseg.lift import TextSpace
 from splatseg.lift.phrases import (
     ThingLooks,
-    answer_phrases,
     known_name,
+    match_phrases,
     parse_phrase,
     phrase_scores,
     sureness,
     thing_looks,
 )
 from splatseg.lift.vocabulary import Vocabulary
-from splatseg.lift.words import WordAnswers
+from splatseg.lift.words import WordMatches
 
 SPACE = TextSpace(width=3)
 LABELS = ("mug", "desk", "white board", "desk lamp", "rubber duck", "duck", "red mug on the desk")
@@ -210,7 +210,7 @@ def test_colours_tell_things_of_one_name_apart() -> None:
     looks.colours[:] = torch.tensor(
         [parse_phrase("green mug").colour, parse_phrase("red mug").colour, (50.0, 0.0, 0.0)]
     )
-    whole = WordAnswers(
+    whole = WordMatches(
         words=("mug", "red mug on the desk", "white board"),
         cosines=torch.tensor([[0.9, 0.8, 0.1], [0.9, 0.7, 0.1], [0.0, 0.1, 0.1]]),
         probabilities=torch.tensor([[0.9, 0.5, 0.1], [0.9, 0.4, 0.1], [0.0, 0.0, 0.1]]),
@@ -221,7 +221,7 @@ def test_colours_tell_things_of_one_name_apart() -> None:
         asked.append(word)
         return {"mug": torch.tensor([0.9, 0.9, 0.0]), "desk": torch.tensor([0.0, 0.0, 0.9])}[word]
 
-    scores, sure = answer_phrases(whole, lambda: looks, VOCABULARY, ask)
+    scores, sure = match_phrases(whole, lambda: looks, VOCABULARY, ask)
     assert torch.equal(scores[:, [0, 2]], 10 * whole.cosines[:, [0, 2]])
     assert torch.equal(sure[:, [0, 2]], whole.probabilities[:, [0, 2]])
     assert int(scores[:, 1].argmax()) == 1

@@ -11,10 +11,10 @@ from splatseg.core import Camera, Renderable, Scan
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.lift import point_shapes, viewed_points
 from splatseg.lift.viewed_points import (
-    SeenView,
+    PointView,
     ViewedPointOptions,
     ViewedPoints,
-    points_in_sight,
+    points_in_view,
     view_votes,
 )
 from support.analytic import BALL, FLOOR, BallOverFloor
@@ -231,10 +231,10 @@ def test_bad_input_is_refused() -> None:
 WALL = 4.0
 
 
-def wall(columns: torch.Tensor | None = None, depth: float = WALL) -> SeenView:
+def wall(columns: torch.Tensor | None = None, depth: float = WALL) -> PointView:
     camera = camera_at()
     shown = torch.zeros(camera.height, camera.width, dtype=torch.int32)
-    return SeenView(
+    return PointView(
         camera=camera,
         columns=shown if columns is None else columns,
         depth=torch.full(shown.shape, depth),
@@ -313,24 +313,24 @@ def test_what_lies_before_a_surface_or_a_little_behind_is_seen(monkeypatch) -> N
     ])  # fmt: skip
     # 2 m, 3 % and 0.1 m: up to 2.16 m.
     seen = [True, True, False, False, False, False, False]
-    assert points_in_sight(points, [(camera(), wall_of_sight())]).tolist() == seen
-    assert points_in_sight(points, []).tolist() == [False] * 7
+    assert points_in_view(points, [(camera(), wall_of_sight())]).tolist() == seen
+    assert points_in_view(points, []).tolist() == [False] * 7
     # A scene in decimetres: the same wall and points.
-    scaled = points_in_sight(10 * points, [(camera(), wall_of_sight(20.0))], metres_per_unit=0.1)
+    scaled = points_in_view(10 * points, [(camera(), wall_of_sight(20.0))], metres_per_unit=0.1)
     assert scaled.tolist() == seen
 
 
 def test_one_view_is_enough() -> None:
     points = torch.tensor([[-0.1, 0, 1.0], [4.9, 0, 1.0], [9.9, 0, 1.0]])
     views = [(camera(5.0), wall_of_sight()), (camera(), wall_of_sight())]
-    assert points_in_sight(points, views).tolist() == [True, True, False]
-    assert points_in_sight(points, views[::-1]).tolist() == [True, True, False]
+    assert points_in_view(points, views).tolist() == [True, True, False]
+    assert points_in_view(points, views[::-1]).tolist() == [True, True, False]
 
 
 def test_what_is_refused() -> None:
     with pytest.raises(ShapeError, match="^points: "):
-        points_in_sight(torch.zeros(3, 2), [])
+        points_in_view(torch.zeros(3, 2), [])
     with pytest.raises(RangeError, match="^points: "):
-        points_in_sight(torch.full((1, 3), torch.nan), [])
+        points_in_view(torch.full((1, 3), torch.nan), [])
     with pytest.raises(ShapeError, match="^depth: "):
-        points_in_sight(torch.zeros(1, 3), [(camera(), wall_of_sight()[::2])])
+        points_in_view(torch.zeros(1, 3), [(camera(), wall_of_sight()[::2])])

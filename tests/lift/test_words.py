@@ -9,7 +9,7 @@ from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.io.evidence import TextEmbeddings
 from splatseg.lift import TextSpace
 from splatseg.lift.vocabulary import Vocabulary
-from splatseg.lift.words import CONTEXT_WORDS, answer_words, context_of, word_span
+from splatseg.lift.words import CONTEXT_WORDS, context_of, match_words, word_span
 
 WORDS = TextEmbeddings(
     labels=("mug", "cup", "desk", "lamp", "object"),
@@ -30,7 +30,7 @@ def asked(words, **constants):
     with pytest.MonkeyPatch.context() as patch:
         for name, value in constants.items():
             patch.setattr(f"splatseg.lift.words.{name.upper()}", value)
-        return answer_words(VALUES, words, VOCABULARY, span)
+        return match_words(VALUES, words, VOCABULARY, span)
 
 
 def test_by_hand() -> None:

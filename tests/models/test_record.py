@@ -13,9 +13,8 @@ from splatseg.core.models import DeepFeatures
 from splatseg.errors import FileFormatError, InputError, ShapeError
 from splatseg.io.evidence import open_evidence, save_depth_map, save_label_map
 from splatseg.io.images import load_image
-from splatseg.models import EvidenceRequest, ModelCache, record_evidence, recorded_model
+from splatseg.models import EvidenceRequest, record_evidence, recorded_model
 from splatseg.models._images import LastImages
-from splatseg.models.recorded import RecordedDepth
 
 
 class Counting:
@@ -124,19 +123,6 @@ def test_one_that_fails_leaves_whole_views_of_both(views, tmp_path) -> None:
     assert (seen.kept, seen.further[0].kept) == (3, 2)
 
 
-def test_what_is_cached_is_not_looked_at_again(views, tmp_path) -> None:
-    cache = ModelCache(folder=tmp_path / "cache")
-    record_evidence(
-        Counting(), views[:1], tmp_path / "a", EvidenceRequest(what="features", cache=cache)
-    )
-    model = Counting()
-    record_evidence(model, views, tmp_path / "b", EvidenceRequest(what="features", cache=cache))
-    assert model.passes == [1, 1], "the second of the first two, then the third"
-    model = Counting()
-    record_evidence(model, views, tmp_path / "c", EvidenceRequest(what="features", cache=cache))
-    assert model.passes == []
-
-
 def test_kinds_that_cannot_be(views, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="expected different kinds, got masks, masks"):
         record_evidence(Counting(), views, tmp_path / "e", EvidenceRequest(what=["masks", "masks"]))
@@ -163,7 +149,7 @@ def test_images_of_different_sizes_are_not_put_together(views, tmp_path, rng) ->
     assert model.passes == [1, 1, 1]
 
 
-# Depth maps of models: written, gone on with, cached, copied.
+# Depth maps of models: written, gone on with, copied.
 
 
 class Near:
@@ -206,23 +192,6 @@ def test_a_map_of_another_size_is_refused(views, tmp_path) -> None:
         record_evidence(Small(), views, tmp_path / "e")
 
 
-@pytest.mark.parametrize("sure", [True, False])
-@pytest.mark.parametrize("precision", ["float16", "int8"])
-def test_a_cache_keeps_it_as_evidence_does(tmp_path, rng, sure, precision) -> None:
-    image = torch.from_numpy(rng.integers(0, 256, (9, 7, 3)).astype("uint8"))
-    model = Near(sure=sure)
-    cache = ModelCache(folder=tmp_path / "cache", precision=precision)
-    first, second = (cache.ask("depth", model, image) for _ in range(2))
-    assert model.asked == 1
-    direct = Near(sure=sure).depth_map(image)
-    for found in (first, second):
-        assert found.kind == "relative"
-        assert torch.equal(found.values, direct.values.half().float())
-        assert (found.confidence is not None) == sure
-    if sure:
-        assert torch.equal(first.confidence, direct.confidence.half().float())
-
-
 def test_recorded_maps_are_copied_at_their_own_size(views, tmp_path) -> None:
     """A network's half-size maps stay so: between a thing and its ground there is no depth."""
     (tmp_path / "there").mkdir()
@@ -232,16 +201,13 @@ def test_recorded_maps_are_copied_at_their_own_size(views, tmp_path) -> None:
         given = DepthMap(values=values, kind="metric", confidence=confidence)
         save_depth_map(given, tmp_path / "there", view.name)
     model = recorded_model(tmp_path / "there", views=views)
-    assert isinstance(model, RecordedDepth)
+    assert model.evidence.kind == "depth"
     seen = record_evidence(model, views, tmp_path / "e", EvidenceRequest(what="depth"))
     assert seen.notes == ("1 views have no depth at all (v0).",)
     found = open_evidence(tmp_path / "e").depth_map("v2")
     assert (found.height, found.width, found.kind) == (24, 32, "metric")
     assert float(found.values.mean()) == 2
     assert float(found.confidence.mean()) == 0.25
-    from splatseg.io.images import load_image
-
-    assert model.depth_map(load_image(views[1])).values.unique().tolist() == [1]
     with pytest.raises(InputError, match="expected evidence of masks, got depth"):
         record_evidence(model, views, tmp_path / "f", EvidenceRequest(what="masks"))
 

@@ -10,24 +10,16 @@ import torch
 from PIL import Image as Picture
 
 from splatseg.core import (
-    AutomaticMasks,
-    DenseFeatures,
     FeatureMap,
     LabelMap,
     MaskSet,
-    MaskTracker,
     Model,
-    PanopticSegments,
     Prompt,
     PromptableMasks,
     Segment,
-    SemanticLabels,
-    TextFeatures,
-    Track,
 )
 from splatseg.core.models import DeepFeatures
 from splatseg.errors import FileFormatError, InputError, MissingFileError, RangeError, ShapeError
-from splatseg.io.captures import read_capture
 from splatseg.io.evidence import (
     FeatureEvidence,
     create_evidence,
@@ -36,11 +28,9 @@ from splatseg.io.evidence import (
     save_label_map,
     save_masks,
     save_segments,
-    save_tracks,
 )
 from splatseg.io.images import load_image
-from splatseg.models import EvidenceRequest, ModelCache, find_model, record_evidence, recorded_model
-from support.shared import generated_and
+from splatseg.models import EvidenceRequest, find_model, record_evidence, recorded_model
 
 
 class Pyramid:
@@ -91,24 +81,9 @@ def test_see_writes_all_depths_and_the_class_token(views, tmp_path) -> None:
     check(open_evidence(tmp_path / "e"), views, model)
 
 
-def test_the_cache_holds_them_too(views, tmp_path) -> None:
-    model = Pyramid()
-    cache = ModelCache(folder=tmp_path / "cache")
-    record_evidence(model, views, tmp_path / "a", EvidenceRequest(cache=cache))
-    record_evidence(model, views, tmp_path / "b", EvidenceRequest(cache=cache))
-    assert model.calls == len(views)
-    for view in views:
-        first, second = (tmp_path / name / f"{view.name}.npz" for name in "ab")
-        assert first.read_bytes() == second.read_bytes()
-    check(open_evidence(tmp_path / "b"), views, model)
-
-
-def test_recorded_evidence_is_a_model_of_all_depths(views, tmp_path) -> None:
+def test_recorded_evidence_is_copied_with_all_depths(views, tmp_path) -> None:
     record_evidence(Pyramid(), views, tmp_path / "e")
     recorded = find_model(tmp_path / "e")
-    deep = recorded.features(torch.zeros(48, 64, 3, dtype=torch.uint8), view="v0")
-    assert deep.depths == ("block1", "block2")
-    assert deep.class_token.shape == (3,)
     record_evidence(recorded, views, tmp_path / "copy")
     for view in views:
         first, second = (tmp_path / name / f"{view.name}.npz" for name in ("e", "copy"))
@@ -200,23 +175,15 @@ def answer(model, prompt: Prompt) -> MaskSet:
 
 def test_the_view_is_told_by_name_or_found_by_content(masks_folder, views) -> None:
     model = recorded_model(masks_folder, views=views)
-    assert isinstance(model, AutomaticMasks)
     assert isinstance(model, PromptableMasks)
-    assert len(model.masks(image(), view="v0")) == 3
-    assert len(model.masks(load_image(views[1]))) == 3
+    assert model.embed(image(), view="v0").view == "v0"
     assert model.embed(load_image(views[1])).view == "v1"
     with pytest.raises(InputError, match="there is nothing of view 'v2'"):
-        model.masks(load_image(views[2]))
+        model.prompted_masks(model.embed(load_image(views[2])), Prompt(mask=MUG))
     with pytest.raises(InputError, match="photograph of one of 3 views"):
-        model.masks(load_image(views[1]) // 2)
+        model.embed(load_image(views[1]) // 2)
     with pytest.raises(InputError, match="name of the view"):
-        recorded_model(masks_folder).masks(image())
-
-
-def test_a_mask_of_another_size_than_the_image_is_refused(masks_folder) -> None:
-    model = recorded_model(masks_folder)
-    with pytest.raises(FileFormatError, match="view 'v0': expected 32x24 pixels .* got 64x48"):
-        model.masks(torch.zeros(24, 32, 3, dtype=torch.uint8), view="v0")
+        recorded_model(masks_folder).embed(image())
 
 
 def test_a_point_means_the_smaller_thing_that_holds_it(masks_folder) -> None:
@@ -267,112 +234,35 @@ def test_an_embedding_of_another_model_is_refused(masks_folder) -> None:
         recorded_model(masks_folder).prompted_masks(embedding, Prompt(mask=MUG))
 
 
-def test_label_maps_are_a_semantic_model(tmp_path) -> None:
+def test_segments_of_label_maps_answer_prompts(tmp_path) -> None:
     ids = torch.full((H, W), -1, dtype=torch.int32)
     ids[MUG] = 4
     folder = create_evidence(tmp_path / "labels", kind="labels")
     save_label_map(LabelMap(ids=ids), folder, "v0")
-    model = find_model(folder)
-    assert isinstance(model, SemanticLabels)
-    assert not isinstance(model, PanopticSegments)
-    assert torch.equal(model.label_map(image(), view="v0").ids, ids)
-    found = answer(model, Prompt(points=torch.tensor([[15.0, 30.0]])))
+    found = answer(find_model(folder), Prompt(points=torch.tensor([[15.0, 30.0]])))
     assert found.masks[0].area == int(MUG.sum())
 
-
-def test_panoptic_and_tracked_folders_are_written_read_and_asked(tmp_path) -> None:
-    ids = torch.full((H, W), 1, dtype=torch.int32)
-    ids[MUG] = 2
     segments = (
         Segment(id=1, category=7, isthing=False, score=0.5),
         Segment(id=2, category=-1, isthing=True, score=1.0),
     )
     folder = create_evidence(tmp_path / "p", kind="panoptic")
     save_segments({"v0": segments}, folder)
-    save_label_map(LabelMap(ids=ids), folder, "v0")
-    model = find_model(folder)
-    assert isinstance(model, PanopticSegments)
-    given = model.panoptic(image(), view="v0")
-    assert given.segments == segments
-    assert torch.equal(given.ids.ids, ids)
+    save_label_map(LabelMap(ids=torch.where(ids == 4, 2, 1).int()), folder, "v0")
+    found = answer(find_model(folder), Prompt(points=torch.tensor([[15.0, 30.0]])))
+    assert found.masks[0].area == int(MUG.sum())
     with pytest.raises(InputError, match="ids of their own"):
         save_segments({"v0": (segments[0], segments[0])}, folder)
 
-    folder = create_evidence(tmp_path / "t", kind="tracked")
-    save_tracks((Track(id=1, votes={"wall": 3}), Track(id=2, votes={})), folder, order=("v1", "v0"))
-    for name in ("v0", "v1"):
-        save_label_map(LabelMap(ids=ids), folder, name)
-    model = find_model(folder)
-    assert isinstance(model, MaskTracker)
-    frames = iter([("v1", image()), ("v0", image())])
-    tracked = model.track(frames, {})
-    assert next(tracked)[0] == "v1"
-    assert next(frames)[0] == "v0", "frames are taken one at a time"
-    with pytest.raises(InputError, match="seeds"):
-        list(model.track([("v1", image())], {"v1": LabelMap(ids=ids)}))
 
-
-@generated_and("office")
-def test_recorded_features_of_other_programs(rich_capture) -> None:
-    view = read_capture(rich_capture).train_views[0]
-    rows, columns = view.camera.height // 16, view.camera.width // 16
-    photograph = load_image(view)
-    dino = find_model(rich_capture / "features_dino")
-    assert isinstance(dino, DenseFeatures)
-    assert not isinstance(dino, TextFeatures)
-    deep = dino.features(photograph, view=view.name)
-    assert deep.depths == ("block3", "block6", "block9", "block12")
-    assert [m.features.shape[:2] for m in deep.maps] == [(rows, columns)] * 4
-    assert not torch.equal(deep.maps[0].features, deep.maps[3].features)
-
-    text = find_model(rich_capture / "features_text")
-    assert isinstance(text, TextFeatures)
-    dense = text.text_features(photograph, view=view.name)
-    words = text.encode_text(["floor", "wall"])
-    assert words.shape == (2, dense.channels)
-    for vectors in (dense.features, words):
-        assert torch.allclose(vectors.norm(dim=-1), torch.ones(vectors.shape[:-1]), atol=1e-4)
-    assert text.encode_text([]).shape == (0, dense.channels)
-    with pytest.raises(InputError, match="recorded words .* got 'zebra crossing'"):
-        text.encode_text(["zebra crossing"])
-    with pytest.raises(FileFormatError, match="cover a photograph of 100x100"):
-        text.text_features(torch.zeros(100, 100, 3, dtype=torch.uint8), view=view.name)
-
-
-def test_words_of_another_width_than_the_features_are_refused(tmp_path, rng) -> None:
-    folder = tmp_path / "features_text"
-    folder.mkdir()
-    np.savez(folder / "v0.npz", f=rng.integers(-9, 9, (6, 8, 3), dtype=np.int8))
-    np.savez(
-        folder / "basis.npz",
-        scale=np.ones(3),
-        offset=np.zeros(3),
-        stride=8,
-        basis=rng.normal(size=(3, 5)),
-        mean=np.zeros(5),
-    )
-    words = {"labels": ["a"], "vectors": np.ones((1, 4)), "kind": ["class"], "target_id": [1]}
-    np.savez(tmp_path / "text_embeddings.npz", **words)
-    with pytest.raises(ShapeError, match="vectors of 5 numbers as the features have, got 4"):
-        find_model(folder)
-    np.savez(folder / "text_embeddings.npz", **(words | {"vectors": np.ones((1, 5))}))
-    model = find_model(folder)
-    assert isinstance(model, TextFeatures), "words in the folder come before those beside it"
-    assert model.evidence.view_names == ("v0",)
-
-
-def test_own_features_with_words_of_their_width_are_text_features(tmp_path) -> None:
+def test_features_and_depth_answer_no_prompts(tmp_path) -> None:
     folder = create_evidence(tmp_path / "f", kind="features")
-    cells = torch.zeros(6, 8, 2)
-    cells[..., 0] = 3.0
-    save_features(FeatureMap(features=cells, stride=8, height=H, width=W), folder, "v0")
-    assert isinstance(find_model(folder), DenseFeatures)
-    words = {"labels": ["a"], "vectors": np.eye(2)[:1], "kind": ["class"], "target_id": [1]}
-    np.savez(folder / "text_embeddings.npz", **words)
+    save_features(
+        FeatureMap(features=torch.ones(6, 8, 2), stride=8, height=H, width=W), folder, "v0"
+    )
     model = find_model(folder)
-    assert isinstance(model, TextFeatures)
-    given = model.text_features(image(), view="v0").features
-    assert torch.equal(given[..., 0], torch.ones(6, 8))
+    assert model.evidence.view_names == ("v0",)
+    assert not isinstance(model, PromptableMasks)
 
 
 # Files that others write

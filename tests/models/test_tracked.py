@@ -29,7 +29,6 @@ from splatseg.io.evidence import (
 )
 from splatseg.models import (
     EvidenceRequest,
-    ModelCache,
     TrackingOptions,
     find_model,
     record_evidence,
@@ -348,9 +347,6 @@ def test_what_does_not_go_together(moving, masks, tmp_path) -> None:
     model = ByColour()
     with pytest.raises(InputError, match="model 'by-colour': expected seeds, the name of evidence"):
         record_evidence(model, moving, tmp_path / "t")
-    cache = ModelCache(folder=tmp_path / "c")
-    with pytest.raises(InputError, match="cache: keeps answers to single photographs"):
-        record_evidence(model, moving, tmp_path / "t", EvidenceRequest(seeds=masks, cache=cache))
     for what in ("masks", ["tracked", "masks"]):
         with pytest.raises(InputError, match=r"what it gives \(tracked\), got 'masks'"):
             record_evidence(model, moving, tmp_path / "t", EvidenceRequest(seeds=masks, what=what))

@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from splatseg.neighbours import NeighbourIndex, NeighbourLists, Neighbours, reference
+from splatseg.neighbours import NeighbourIndex, NeighbourLists, Neighbours
+from support import neighbours_reference as reference
 
 SHAPES = ("uniform", "lattice", "clusters", "line", "shells", "doubles")
 
@@ -102,18 +103,6 @@ def test_within(points: Tensor, seed: int, reach: float, most: int | None) -> No
     assert_same_lists(got, reference.within(points, queries, reach, max_neighbours=most))
     everything = reference.within(points, queries, reach)
     assert torch.equal(index.count_within(queries, reach), everything.counts)
-
-
-@given(points=clouds, seed=st.integers(0, 99), reach=reaches)
-def test_others_within(points: Tensor, seed: int, reach: float) -> None:
-    index = NeighbourIndex(points)
-    own = torch.arange(len(points))
-    want = reference.within(points, points, reach, own=own)
-    assert_same_lists(index.others_within(reach), want)
-    g = torch.Generator().manual_seed(seed)
-    rows = torch.randperm(len(points), generator=g)[:20]
-    want = reference.within(points, points[rows], reach, max_neighbours=3, own=rows)
-    assert_same_lists(index.others_within(reach, rows=rows, max_neighbours=3), want)
 
 
 @pytest.mark.usefixtures("every_isa")

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from splatseg import _native
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.neighbours import NeighbourIndex, ball_means, reference
+from splatseg.neighbours import NeighbourIndex, ball_means
+from support import neighbours_reference as reference
 
 
 def cloud(count: int, seed: int, lattice: bool) -> Tensor:

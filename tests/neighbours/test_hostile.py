@@ -70,7 +70,7 @@ def test_threads_change_nothing(shape: str) -> None:
             _native.set_threads(threads)
             index = NeighbourIndex(points)
             near, others = index.nearest(queries, 9), index.nearest_others(9)
-            lists = index.others_within(0.1, max_neighbours=20)
+            lists = index.within(points, 0.1, max_neighbours=20)
             found = [near.indices, near.distances, others.indices, others.distances]
             answers.append((*found, lists.starts, lists.indices, lists.distances))
     finally:

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from splatseg import _native
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.neighbours import NeighbourIndex, Subset, reference
+from splatseg.neighbours import NeighbourIndex, Subset
+from support import neighbours_reference as reference
 
 SHAPES = ("uniform", "lattice", "clusters", "line", "doubles", "strays")
 

@@ -5,10 +5,10 @@ import pytest
 
 from splatseg.pose._pairs import (
     all_pairs,
-    chosen_pairs,
     connected_groups,
     likeness,
     linking_pairs,
+    selected_pairs,
 )
 
 
@@ -50,8 +50,8 @@ def test_a_photograph_without_features_looks_like_none(rng: np.random.Generator)
     assert not alike[4, :4].any()
     assert np.array_equal(likeness([empty, empty], seed=0), np.eye(2))
     # It is compared with those that follow by name, and never chosen for its looks.
-    assert (0, 4) not in chosen_pairs(alike, overlap=1, neighbours=4)
-    assert (3, 4) in chosen_pairs(alike, overlap=1, neighbours=4)
+    assert (0, 4) not in selected_pairs(alike, overlap=1, neighbours=4)
+    assert (3, 4) in selected_pairs(alike, overlap=1, neighbours=4)
 
 
 def test_every_pair_once() -> None:
@@ -62,7 +62,7 @@ def test_every_pair_once() -> None:
 def test_a_loop_is_closed_by_looks() -> None:
     alike = np.full((10, 10), 0.1, np.float32)
     alike[0, 9] = alike[9, 0] = 0.9
-    pairs = chosen_pairs(alike, overlap=2, neighbours=1)
+    pairs = selected_pairs(alike, overlap=2, neighbours=1)
     assert (0, 9) in pairs
     assert all(i < j for i, j in pairs)
     assert {(i, j) for i, j in pairs if j - i <= 2} == {

@@ -75,21 +75,6 @@ def test_the_threshold_of_points_is_the_mean_of_cosines(gaussians, view, values)
         assert torch.equal(found, (ids == 1) | (ids == 3))
 
 
-def test_the_threshold_of_the_code_is_the_best_tenth_or_what_a_mask_shows(
-    gaussians, view, values, rng
-) -> None:
-    values = values + 0.02 * torch.from_numpy(rng.normal(size=values.shape)).float()
-    ids = field_ids(gaussians)
-    options = FeatureMembershipOptions(rule="code")
-    source = FeatureMembership(Features(values=values), gaussians, options=options)
-    found = source.membership(clicks(gaussians, view, UPPER_LEFT)) > 0.5
-    assert int(found.sum()) == len(values) // 10
-    assert (ids[found] == 1).all()
-    mask = region(slice(SKY_ROWS + 1, 19), slice(2, 18))
-    by_mask = source.membership(see_prompts(gaussians, [ViewPrompt(view=view, mask=mask)])) > 0.5
-    assert 0 < int(by_mask.sum()) < int(found.sum()), "mean and deviation of the mask are higher"
-
-
 def test_the_gate_of_the_granularity_is_used(gaussians, view) -> None:
     ids = field_ids(gaussians)
     # Channels 0 and 1 tell left from right, 2 and 3 upper from lower: open for parts alone.

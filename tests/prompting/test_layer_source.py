@@ -13,7 +13,7 @@ from splatseg.prompting.layer_source import (
     NearestId,
     agreed,
     nearest_id,
-    pixels_around,
+    neighbouring_pixels,
     shown_ids,
 )
 from splatseg.prompting.pipeline import MembershipSource, SimilaritySource
@@ -29,7 +29,7 @@ def own(id: int) -> int:
 
 
 def test_seven_by_seven_pixels_have_a_say_by_their_distance() -> None:
-    pixels, votes = pixels_around(torch.tensor([12, 15]), HEIGHT, WIDTH)
+    pixels, votes = neighbouring_pixels(torch.tensor([12, 15]), HEIGHT, WIDTH)
     assert len(pixels) == 49
     say = dict(zip(map(tuple, pixels.tolist()), votes.tolist(), strict=True))
     assert say[12, 15] == 1
@@ -39,9 +39,9 @@ def test_seven_by_seven_pixels_have_a_say_by_their_distance() -> None:
 
 
 def test_no_pixel_outside_the_picture_has_a_say() -> None:
-    corner, _ = pixels_around(torch.tensor([0, 0]), HEIGHT, WIDTH)
+    corner, _ = neighbouring_pixels(torch.tensor([0, 0]), HEIGHT, WIDTH)
     assert sorted(map(tuple, corner.tolist())) == [(x, y) for x in range(4) for y in range(4)]
-    last, _ = pixels_around(torch.tensor([WIDTH - 1, HEIGHT - 1]), HEIGHT, WIDTH)
+    last, _ = neighbouring_pixels(torch.tensor([WIDTH - 1, HEIGHT - 1]), HEIGHT, WIDTH)
     assert tuple(last.amax(dim=0).tolist()) == (WIDTH - 1, HEIGHT - 1)
     assert len(last) == 16
 

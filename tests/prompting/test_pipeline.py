@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.neighbours import NeighbourIndex, Subset, reference
+from splatseg.neighbours import NeighbourIndex, Subset
 from splatseg.prompting import pipeline
 from splatseg.prompting.pipeline import (
     SceneIndex,
@@ -28,6 +28,7 @@ from splatseg.prompting.pipeline import (
 )
 from splatseg.prompting.prompts import ViewPrompt
 from splatseg.prompting.seen import ViewCache, see_prompts
+from support import neighbours_reference as reference
 from support.wall import field_ids
 
 

@@ -14,7 +14,6 @@ from splatseg.prompting.retrieval import (
     StoredFeatures,
     deviation_threshold,
     mean_threshold,
-    published_threshold,
     scores,
 )
 from support import retrieval as reference
@@ -165,21 +164,11 @@ def test_threads_do_not_matter(threads: int) -> None:
         _native.set_threads(before)
 
 
-def test_thresholds_by_hand(monkeypatch) -> None:
+def test_thresholds_by_hand() -> None:
     found = torch.tensor([0.0, 0.2, 0.4, 0.6, 0.8])
     assert mean_threshold(found) == pytest.approx(0.4)
     assert deviation_threshold(found) == pytest.approx(0.4 + 0.08**0.5)
     assert mean_threshold(found[:0]) == deviation_threshold(found[:0]) == 0
-    assert published_threshold(torch.arange(20.0), found[:0]) == 17, "the best tenth is above"
-    low = torch.tensor([-0.5, -0.5])
-    monkeypatch.setattr(retrieval, "_TOP", 0.4)
-    assert published_threshold(found, low) == pytest.approx(0.4)
-    assert int((found > published_threshold(found, low)).sum()) == 2
-    assert published_threshold(found, torch.tensor([0.9, 0.9])) == pytest.approx(0.9)
-    monkeypatch.setattr(retrieval, "_TOP", 0.9)
-    assert published_threshold(-found, low) == 0
-    monkeypatch.setattr(retrieval, "_TOP", 1.0)
-    assert published_threshold(found, low) == 0
 
 
 def test_what_is_refused() -> None:

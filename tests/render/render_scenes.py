@@ -59,9 +59,6 @@ class Bench:
             gaussians, camera, pixels, k, options=self.options(), backend=self.name
         )
 
-    def image_weights(self, gaussians: Gaussians, camera: Camera):
-        return splat.image_weights(gaussians, camera, options=self.options(), backend=self.name)
-
 
 def random_camera(rng: np.random.Generator, *, width: int = 50, height: int = 40) -> Camera:
     """A camera near the origin that looks along z, slightly turned, off-centre."""

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from splatseg.errors import ShapeError
-from splatseg.render import ImageWeights, image_weights, weights
+from splatseg.render import prepare, weights
 from splatseg.render.cpu import set_threads
 
 from .render_scenes import Bench, random_camera, random_gaussians
@@ -31,17 +31,12 @@ def dense(scene, part: torch.Tensor, backend: Bench) -> np.ndarray:
 
 
 def sums(scene, part: torch.Tensor, backend: Bench) -> np.ndarray:
-    gaussians, camera = scene
-    image = image_weights(gaussians, camera, options=backend.options(), backend=backend.name)
-    assert isinstance(image, ImageWeights)
-    found = image.part_sums(part)
-    table = np.zeros((len(found.indptr) - 1, len(gaussians)))
-    for row in range(len(table)):
-        entries = slice(int(found.indptr[row]), int(found.indptr[row + 1]))
-        assert bool((found.ids[entries].diff() > 0).all())
-        table[row, found.ids[entries].numpy()] = found.sums[entries].numpy()
-    assert bool((found.sums > 0).all())
-    return table
+    with prepare(*scene, options=backend.options(), backend=backend.name) as view:
+        found, again = view.part_sums([part, part])
+    assert (found != again).nnz == 0
+    assert found.has_sorted_indices
+    assert (found.data > 0).all()
+    return found.toarray()
 
 
 @pytest.fixture

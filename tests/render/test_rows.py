@@ -91,11 +91,10 @@ def test_median_contributor_has_the_median_depth(backend, camera, scene):
     torch.testing.assert_close(drawn.median_depth.flatten(), depth.float(), rtol=1e-6, atol=0)
 
 
-@pytest.mark.parametrize("kind", ["weights", "image_weights"])
 @pytest.mark.parametrize("channels", [1, 5, 64])
-def test_kept_weights_render_and_back_project(backend, rng, camera, scene, kind, channels):
+def test_kept_weights_render_and_back_project(backend, rng, camera, scene, channels):
     """Half precision rounds each weight by at most 2^-11 of it."""
-    kept = getattr(backend, kind)(scene, camera)
+    kept = backend.weights(scene, camera)
     assert kept.shape == (WIDTH * HEIGHT, COUNT)
     assert kept.nbytes > 0
     signal = float32(rng.normal(size=(COUNT, channels)))
@@ -158,17 +157,15 @@ def test_csr_can_keep_the_strongest_only(backend, rng, camera, scene, of_pixels)
         assert (row.diff() >= -1e-6 * row[1:]).all(), "still front to back"
 
 
-@pytest.mark.parametrize("kind", ["weights", "image_weights"])
-def test_an_empty_scene_has_an_empty_matrix(backend, rng, camera, kind):
-    kept = getattr(backend, kind)(random_gaussians(rng, 0), camera)
+def test_an_empty_scene_has_an_empty_matrix(backend, rng, camera):
+    kept = backend.weights(random_gaussians(rng, 0), camera)
     assert kept.shape == (WIDTH * HEIGHT, 0)
     assert not kept.product(torch.zeros(0, 4)).any()
     assert kept.adjoint(torch.ones(WIDTH * HEIGHT, 4)).shape == (0, 4)
 
 
-@pytest.mark.parametrize("kind", ["weights", "image_weights"])
-def test_kept_weights_refuse_other_shapes(backend, camera, scene, kind):
-    kept = getattr(backend, kind)(scene, camera)
+def test_kept_weights_refuse_other_shapes(backend, camera, scene):
+    kept = backend.weights(scene, camera)
     with pytest.raises(InputError, match="signal"):
         kept.product(torch.zeros(COUNT + 1, 2))
     with pytest.raises(InputError, match="image"):

@@ -34,7 +34,6 @@ def _everything(bench, rng) -> dict[str, torch.Tensor]:
     wide.image.square().sum().backward()
     back = bench.back_project(scene, camera, image)
     csr = bench.weights(scene, camera)
-    blocks = bench.image_weights(scene, camera)
     pixels = torch.stack((torch.arange(90), torch.arange(90)), dim=1)
     rows = bench.contributors(scene, camera, pixels, 5)
     return {
@@ -51,8 +50,6 @@ def _everything(bench, rng) -> dict[str, torch.Tensor]:
         "csr": torch.cat((csr.indptr.double(), csr.ids.double(), csr.weights.double())),
         "csr render": csr.product(signal),
         "csr back": csr.adjoint(image.reshape(-1, 21)),
-        "blocks render": blocks.product(signal),
-        "blocks back": blocks.adjoint(image.reshape(-1, 21)),
         "ids": rows.ids,
         "row weights": rows.weights,
     }

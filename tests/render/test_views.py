@@ -11,8 +11,8 @@ from splatseg.render import (
     contributors,
     default_options,
     get_backend,
-    image_weights,
     options_for,
+    prepare,
     render,
     weights,
 )
@@ -134,7 +134,7 @@ def test_contributors_and_w_read_the_nearest_straight_pixel(gaussians) -> None:
         some.product(ones)[:, 0], alpha[pixels[:, 1], pixels[:, 0]], rtol=0, atol=2e-3
     )
     with pytest.raises(InputError, match="camera: expected one without distortion"):
-        image_weights(gaussians, camera, backend=BACKEND)
+        prepare(gaussians, camera, backend=BACKEND).part_sums([])
 
 
 @pytest.mark.parametrize("lens", LENSES)

@@ -10,7 +10,6 @@ from splatseg.core import ClassInfo, ClassTable
 from splatseg.report.html import Notice, report_html
 from splatseg.report.images import Gallery, GalleryImage
 from splatseg.report.street_report import (
-    DepthError,
     LevelFacts,
     PointCounts,
     StreetReportData,
@@ -24,12 +23,6 @@ CLASSES = ClassTable(
     rows=(ClassInfo(id=1, name="road", colour=(9, 9, 9)), ClassInfo(id=7, name="car & van"))
 )
 BARE = StreetReportData(scene="drive", name="street", layer="classes", classes=CLASSES)
-
-
-def error(view: str, before: float | None, after: float | None) -> DepthError:
-    return DepthError(
-        view=view, rays=10, before=before, after=after, met_before=0.5, met_after=0.25
-    )
 
 
 def trained(steps: int) -> tuple[RadianceRecord, ...]:
@@ -53,7 +46,6 @@ def whole(**changes) -> StreetReportData:
         "levels": (
             LevelFacts(side=0.5, started=1300, kept=1200), LevelFacts(side=1, started=34, kept=34),
         ),
-        "depth": (error("a", 0.4, 0.1), error("b", 0.6, 0.3), error("c", None, None)),
         "shaping": shaped, "training": trained(3), "psnr": {"a": 20.0, "b": 23.0},
         "points": PointCounts(
             folder="labels", by="the vertices of the mesh field", vertex_rule="weighed",
@@ -78,11 +70,6 @@ def test_all_that_is_known_is_told() -> None:
     assert "Field street: 1\N{THIN SPACE}234 primitives with 2 classes." in page
     assert "points of 2 scans labelled by the vertices of the mesh field" in page
     assert cells(page, "Primitives") == [["0", "0.5", "1300", "1200"], ["1", "1", "34", "34"]]
-    assert cells(page, "Error of depth") == [
-        ["a", "10", "0.400", "0.100", "0.500", "0.250"],
-        ["b", "10", "0.600", "0.300", "0.500", "0.250"],
-        ["c", "10", "\N{EN DASH}", "\N{EN DASH}", "0.500", "0.250"],
-    ]
     assert cells(page, "Points by class") == [
         ["car &amp; van", "7", "600", "0.600"],
         ["road", "1", "300", "0.300"],
@@ -90,7 +77,8 @@ def test_all_that_is_known_is_told() -> None:
     ]
     assert cells(page, "Time") == [["points", "1.000"], ["field", "2.500"], ["together", "3.500"]]
     for words in (
-        "0.20 m", "median; 0.50 m before", "21.5 dB", "90.0%", "Moving things", "labels_semantic",
+        "0.50 m", "1.00 m in its first steps", "21.5 dB", "90.0%", "Moving things",
+        "labels_semantic",
         "splatseg street drive", "Error of depth, m", "Squared error of colours",
         "Cross-entropy of classes", "level 1",
     ):  # fmt: skip
@@ -108,7 +96,7 @@ def test_what_is_not_known_is_left_out() -> None:
     assert page.blocks == ()
     assert [figure.label for figure in page.figures] == ["primitives"]
     assert "<h1>Street drive</h1>" in report_html(page)
-    labels_alone = street_report(whole(name="", levels=(), depth=(), shaping=(), training=()))
+    labels_alone = street_report(whole(name="", levels=(), shaping=(), training=()))
     assert "Field" not in labels_alone.summary
     assert "primitives" not in [figure.label for figure in labels_alone.figures]
     blocks = street_report(whole(name="street", blocks=3)).summary
@@ -138,9 +126,9 @@ def test_a_long_training_is_a_curve_of_means() -> None:
 
 def test_the_record_is_json() -> None:
     record = json.loads(json.dumps(street_record(whole()), allow_nan=False))
-    assert record["depth_error"] == {"before": 0.5, "after": 0.2}
+    assert record["depth_error"] == {"first": 1.0, "last": 0.5}
     assert record["points"]["ids"] == {"1": 300, "7": 600}
     assert record["levels"][0] == {"side": 0.5, "started": 1300, "kept": 1200}
     assert record["classes"] == {"1": "road", "7": "car & van"}
-    assert street_record(BARE)["depth_error"] == {"before": None, "after": None}
+    assert street_record(BARE)["depth_error"] is None
     assert "points" not in street_record(BARE)

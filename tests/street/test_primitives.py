@@ -17,12 +17,12 @@ from splatseg.street.primitives import (
 )
 from splatseg.street.shapes import (
     ShapeConfig,
-    new_shapes,
     primitive_scale,
     sphere_code,
     template,
 )
 from support.primitives import shipped, sphere, spheres
+from support.shape_quality import new_shapes
 
 
 def voxels(points: torch.Tensor, **options: Any) -> Primitives:

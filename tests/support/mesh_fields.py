@@ -1,9 +1,13 @@
 """Small mesh fields that were never trained, and one that says what it is told."""
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
-from splatseg.core import LayerInfo
+from splatseg.core import Camera, LayerInfo
+from splatseg.street.depth_views import axis_cosines
 from splatseg.street.field import MeshField
+from splatseg.street.hits import PrimitiveCaster
 from splatseg.street.primitives import PrimitiveMesh
 from splatseg.street.radiance import RadianceModel, RadianceOptions
 from splatseg.street.shapes import template
@@ -80,3 +84,32 @@ def told_field(
         last.bias.fill_(-40)
         last.bias[background] = last.bias[3 + background] = 40
     return MeshField(mesh, model, info=LayerInfo(names={3: "road", 8: "car", 5: "sky"}))
+
+
+def mesh_distances(
+    mesh: PrimitiveMesh | PrimitiveCaster, camera: Camera
+) -> Float[Tensor, "height width"]:
+    """Distances from the camera's centre to the first hits of the pixels' rays, float32, 0 none.
+
+    Args:
+        mesh: The mesh, or the caster of a mesh that is looked at from several cameras.
+        camera: Its pixels.
+    """
+    caster = mesh if isinstance(mesh, PrimitiveCaster) else PrimitiveCaster(mesh)
+    origin, directions = camera.rays()
+    hits = caster.first(origin, directions.reshape(-1, 3))
+    found = torch.where(hits.faces >= 0, hits.distances, 0.0)
+    return found.view(camera.height, camera.width).float()
+
+
+def mesh_depth(
+    mesh: PrimitiveMesh | PrimitiveCaster, camera: Camera
+) -> Float[Tensor, "height width"]:
+    """z-depth of the first hits of the pixels' rays, scene units, float32, 0 where there is none.
+
+    Args:
+        mesh: The mesh, or the caster of a mesh that is looked at from several cameras.
+        camera: Its pixels.
+    """
+    _, directions = camera.rays()
+    return (mesh_distances(mesh, camera) * axis_cosines(camera, directions)).float()

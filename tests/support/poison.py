@@ -274,15 +274,15 @@ def answers() -> Any:
     from splatseg.core import Features
     from splatseg.lift import TextSpace
     from splatseg.lift.vocabulary import Vocabulary
-    from splatseg.lift.words import WordAnswers, WordIndex
-    from splatseg.tasks import Answers, QueryOptions
+    from splatseg.lift.words import WordIndex, WordMatches
+    from splatseg.tasks import QueryOptions, QueryResult
 
     none = torch.zeros(COUNT, 1)
     values = torch.rand(COUNT, 4, generator=torch.Generator().manual_seed(0))
     vocabulary = Vocabulary(space=TextSpace(width=4))
-    return Answers(
+    return QueryResult(
         words=("cup",), found={"cup": ()}, surest={"cup": 0.0},
-        vectors=WordAnswers(words=("cup",), cosines=none, probabilities=none),
+        vectors=WordMatches(words=("cup",), cosines=none, probabilities=none),
         index=WordIndex(Features(values=values), vocabulary), layer="objects",
         options=QueryOptions(),
     )  # fmt: skip
@@ -309,7 +309,7 @@ def special(world: World, by_type: dict[type, Any]) -> dict[str, Any]:
     return {
         **inner(world, by_type),
         "tasks.select.prompts": [AxisBox(low=(-9, -9, -9), high=(9, 9, 9))],
-        "tasks.draw_answers.answers": answers(),
+        "tasks.draw_query_result.answers": answers(),
         "tasks.draw_heat.answers": answers(),
         "tasks.write_query_report.answers": answers(),
         "tasks.draw_selection.prompts": [AxisBox(low=(-9, -9, -9), high=(9, 9, 9))],
@@ -450,7 +450,7 @@ def inner(world: World, by_type: dict[type, Any]) -> dict[str, Any]:
     from splatseg.io.export import objects_of
     from splatseg.lift import EvidenceSegments, UpliftOptions, uplift
     from splatseg.lift.training import AdamConstants, LabelTargets
-    from splatseg.methods import find_method, methods
+    from splatseg.methods import find_method
     from splatseg.models import find_model
     from splatseg.pose.doctor import Diagnosis, PointCorrection
     from splatseg.tasks import EditOptions, SegmentOptions, SharpenSceneOptions, segment
@@ -480,7 +480,7 @@ def inner(world: World, by_type: dict[type, Any]) -> dict[str, Any]:
         "core.Pointmap.points": torch.rand(2, 3, 3),
         "core.Pointmap.confidence": torch.ones(2, 3),
         "render.SparseWeights.gaussians": COUNT,
-        "render.SparseWeights.weights": torch.zeros(1),
+        "render.SparseWeights.weights": torch.zeros(6),
         "io.evidence.save_tracks.tracks": (),
         "io.evidence.save_tracks.folder": world.path().parent,
         "io.evidence.save_segments.segments": {},
@@ -494,7 +494,6 @@ def inner(world: World, by_type: dict[type, Any]) -> dict[str, Any]:
         "methods.keeps_boundaries.method": "uplift",
         "methods.keeps_ids.method": "uplift",
         "methods.register_method.method": replace(method, name="own"),
-        "methods.methods_table.methods": methods(),
         "models.record_evidence.model": find_model("classical"),
         "models.record_evidence.folder": world.path(),
         "lift.MatchedMaps.source": EvidenceSegments(evidence=world.masks),

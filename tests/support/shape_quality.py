@@ -5,7 +5,10 @@
 
 import functools
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -13,8 +16,19 @@ from torch import Tensor
 from torch.nn import functional
 
 from splatseg._check import check_finite, check_range, check_shape
+from splatseg.core.json_values import plain_object
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.street.shapes import Distance, ShapeAutoEncoder, chamfer, primitive_scale, sphere_code
+from splatseg.io.json_files import json_text
+from splatseg.io.tensors import write_tensors
+from splatseg.street.shape_files import FORMAT, VERSION
+from splatseg.street.shapes import (
+    Distance,
+    ShapeAutoEncoder,
+    ShapeConfig,
+    chamfer,
+    primitive_scale,
+    sphere_code,
+)
 
 _PARALLEL = 1e-6
 _TINY = 1e-8
@@ -455,3 +469,51 @@ def _distances(
 
 def _share(which: Tensor) -> float:
     return float(which.double().mean())
+
+
+def new_shapes(config: ShapeConfig, *, seed: int) -> ShapeAutoEncoder:
+    """An untrained auto-encoder; the same seed gives the same weights.
+
+    PyTorch's own initial values, but for the last layer of the decoder, which begins so small that
+    every code is a near sphere.
+    """
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        shapes = ShapeAutoEncoder(config)
+    with torch.no_grad():
+        for parameter in shapes.decoder.layers[-1].parameters():
+            parameter *= 0.1
+    return shapes
+
+
+def save_shapes(shapes: ShapeAutoEncoder, path: Path, *, facts: Mapping[str, Any]) -> None:
+    """Write an auto-encoder, matrices and offsets as float16, and the facts in the header.
+
+    `load_shapes` is the inverse, but for the rounding.
+
+    Args:
+        shapes: With encoder and decoder.
+        path: The file, ``.safetensors``.
+        facts: How it was trained, and its score: values that JSON holds.
+
+    Raises:
+        InputError: If it has no encoder, a weight is not finite or too large for float16, or the
+            facts hold something that JSON has no word for.
+        OutputError: If it cannot be written.
+    """
+    if shapes.encoder is None:
+        raise InputError("shapes: expected encoder and decoder, got a decoder alone.")
+    state = {name: _halved(name, tensor) for name, tensor in shapes.state_dict().items()}
+    content = {"config": asdict(shapes.config), "facts": plain_object("facts", facts)}
+    metadata = {"format": FORMAT, "version": VERSION, "about": json_text("facts", content)}
+    write_tensors(state, path, metadata=metadata)
+
+
+def _halved(name: str, tensor: Tensor) -> Tensor:
+    half = tensor.half()
+    if not bool(torch.isfinite(half).all()):
+        raise InputError(
+            f"shapes: {name}: expected weights that float16 holds, "
+            f"got {float(tensor.abs().max()):g}."
+        )
+    return half

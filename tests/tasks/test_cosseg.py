@@ -11,10 +11,10 @@ from splatseg.core import Features, Labels
 from splatseg.io.evidence import open_evidence
 from splatseg.io.scene import load_scene, load_scene_layer
 from splatseg.methods.cosseg import CossegOptions
-from splatseg.methods.cosseg.checkpoint import save_point_encoder
 from splatseg.methods.cosseg.network import RandlaEncoder
 from splatseg.methods.cosseg.pyramid import PointInputs, RandlaConfig
 from splatseg.tasks.segment import SegmentOptions, segment
+from splatseg_bench.point_network import save_point_encoder
 from support.checkpoints import saved
 
 LABELS = SegmentOptions(evidence="labels_semantic")

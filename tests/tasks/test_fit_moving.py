@@ -208,7 +208,7 @@ def test_the_command_hands_its_flags_on(monkeypatch, tmp_path) -> None:
     command = Command(
         data=tmp_path,
         output=tmp_path,
-        capture=fit._Scene(
+        capture=MakeSceneOptions(
             moving=Path("b.json"),
             moving_classes=("car",),
             moving_evidence="maps",

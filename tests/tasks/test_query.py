@@ -26,7 +26,7 @@ from splatseg.io.evidence import (
 )
 from splatseg.io.scene import load_scene, load_scene_layer, save_scene_layer
 from splatseg.lift.vocabulary import Vocabulary, vocabulary_of
-from splatseg.tasks import Found, QueryOptions, QuerySession, draw_answers, draw_heat, query
+from splatseg.tasks import Found, QueryOptions, QuerySession, draw_heat, draw_query_result, query
 from splatseg.tasks.pictures import write_query_report
 
 
@@ -292,7 +292,7 @@ def test_a_film_of_heat_along_a_path(folder, layers, words, capsys, tmp_path) ->
 
 def test_pictures_from_python(scene, layers, words, tmp_path) -> None:
     found = query(scene, words, options=LOW, layers=layers)
-    assert len(draw_answers(found, scene, tmp_path / "a", top=1)) == 2
+    assert len(draw_query_result(found, scene, tmp_path / "a", top=1)) == 2
     assert len(draw_heat(found, scene, scene.train_views[:2], tmp_path / "b")) == 6
 
 

@@ -223,7 +223,7 @@ def test_features_trained_as_published_are_asked_as_published(room) -> None:
     assert record("own") == ("fixed", None, every)
     assert record("paper") == ("adaptive", "published", ["filter", "grow"])
     assert record("paper", post_processing="none") == ("adaptive", None, [])
-    assert record("own", threshold="code") == ("code", None, every)
+    assert record("own", threshold="adaptive") == ("adaptive", None, every)
     assert record("paper", post_processing="full", threshold="fixed") == ("fixed", None, every)
     assert record("own", post_processing="published")[1:] == ("published", ["filter", "grow"])
     tree = SelectOptions(post_processing="published", from_layer="all")
@@ -243,7 +243,7 @@ def test_features_trained_as_published_are_asked_as_published(room) -> None:
 
 
 def test_thresholds_change_what_is_selected(room) -> None:
-    """Of features of one direction each but for noise: the mean is below 0.85, the code's above."""
+    """Of features of one direction each but for noise: the mean is below 0.85."""
     scene = load_scene(room)
     count = len(scene.gaussians)
     angles = torch.linspace(0, 3, count)
@@ -256,4 +256,4 @@ def test_thresholds_change_what_is_selected(room) -> None:
         )
         return select(scene, click(scene), options=options, layers=layers).selection.count
 
-    assert selected("adaptive") > selected("fixed") > selected("code")
+    assert selected("adaptive") > selected("fixed")

@@ -19,7 +19,7 @@ from importlib.metadata import entry_points
 from typing import Any
 
 from splatseg.cli._streams import interrupted_by_signals, prepare_streams, silence, tell
-from splatseg.cli._words import default_config, kept_page, option_names, with_flags
+from splatseg.cli._words import default_config, option_names, stored_page, with_flags
 from splatseg.errors import InputError, MissingPackageError, SplatsegError, visible
 
 _MAX_UNPACKED = re.compile("--max-unpacked(=.*)?")
@@ -261,7 +261,7 @@ def _dispatch(words: list[str]) -> int:
     commands = COMMANDS if name in COMMANDS else find_commands()
     if name not in commands:
         raise InputError(_unknown(name, commands))
-    page = kept_page(name, rest)
+    page = stored_page(name, rest)
     if page is not None:
         sys.stdout.write(page)
         return EXIT_DONE

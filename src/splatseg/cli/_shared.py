@@ -8,16 +8,13 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
+from typing import Annotated, Any, TypeAlias, TypeVar
 
 import tyro
 from rich.console import Console
 from rich.progress import (
     BarColumn,
-    MofNCompleteColumn,
     Progress,
-    ProgressColumn,
-    TaskID,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
@@ -32,10 +29,9 @@ from splatseg.io.scene import load_scene
 from splatseg.io.splats import Values
 from splatseg.render import BackendName
 from splatseg.tasks import Observer
+from splatseg.tasks.work import Step
 
-if TYPE_CHECKING:
-    from splatseg.fit import FitProgress
-    from splatseg.pose import PoseProgress
+T = TypeVar("T")
 
 
 def _flag(metavar: str | None, help: str, *aliases: str) -> Any:
@@ -48,7 +44,7 @@ NewScene: TypeAlias = Annotated[
     Path, _flag("NEW", "Scene folder to write. It must not exist yet.", "-o")
 ]
 
-MadeSceneFolder: TypeAlias = Annotated[
+NewSceneFolder: TypeAlias = Annotated[
     Path,
     _flag(
         "SCENE", "Scene folder to write. An existing scene is replaced unless it has layers.", "-o"
@@ -112,19 +108,6 @@ Linear: TypeAlias = Annotated[
 
 Overwrite: TypeAlias = Annotated[
     bool, _flag(None, "Replace what an earlier run wrote under the same name.")
-]
-
-Split: TypeAlias = Annotated[
-    str, _flag("SPLIT", "Views: test, train, another split of the scene, or all.")
-]
-
-SplitOrPath: TypeAlias = Annotated[
-    str,
-    _flag(
-        "SPLIT",
-        "Views: test, train, another split of the scene, all, or path: a smooth path near the "
-        "training cameras.",
-    ),
 ]
 
 Frames: TypeAlias = Annotated[int, _flag("N", "Number of views of a path.")]
@@ -199,23 +182,15 @@ class ProgressLines:
         self._write = write
         self._clock = clock
         self._begin = self._last = clock()
-        self._first: float | None = None
+        self._first: int | None = None
 
-    def show(
-        self,
-        done: float,
-        total: float | None,
-        *,
-        text: str | None = None,
-        seconds_left: float | None = None,
-    ) -> None:
+    def show(self, done: int, total: int, text: str = "") -> None:
         """Take note of how far the work is; a line is written if it is time.
 
         Args:
             done: How much is done.
-            total: Of how much; None where that is not known.
-            text: What is done, in words; None is ``DONE of TOTAL``.
-            seconds_left: Estimate; None goes by the speed since the first call.
+            total: Of how much; 0 where that is not known, and nothing can be estimated.
+            text: What is done, in words; empty is ``DONE of TOTAL``.
         """
         if self._first is None:
             self._first = done
@@ -224,16 +199,13 @@ class ProgressLines:
             return
         self._last = now
         elapsed = now - self._begin
-        if text is None:
-            text = f"{done:g}" if total is None else f"{done:g} of {total:g}"
-        parts = [text]
+        parts = [text or (f"{done} of {total}" if total else f"{done}")]
         if total:
             parts.append(f"{100 * done / total:.0f} %")
-            if seconds_left is None and done > self._first:
-                seconds_left = elapsed * (total - done) / (done - self._first)
         parts.append(f"{_clock_time(elapsed)} elapsed")
-        if seconds_left is not None:
-            parts.append(f"about {_clock_time(seconds_left)} left")
+        if total and done > self._first:
+            left = elapsed * (total - done) / (done - self._first)
+            parts.append(f"about {_clock_time(left)} left")
         self._write(f"{self._what}: {', '.join(parts)}\n")
 
 
@@ -244,118 +216,59 @@ def _clock_time(seconds: float) -> str:
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
 
 
-def lines_on_stderr(what: str) -> ProgressLines | None:
-    """Plain lines where stderr is no terminal; None where it is one, which shows a bar."""
-    if Console(stderr=True).is_terminal:
-        return None
-
-    return ProgressLines(what, write=lambda line: tell(sys.stderr, line))
-
-
 @contextmanager
-def progress(what: str, *, quiet: bool = False) -> Generator[Callable[[int, int], None]]:
-    """Progress of some work on stderr, with an estimate; gives a function of (done, total).
+def progress(what: str, *, quiet: bool = False) -> Generator[Step]:
+    """Progress of some work on stderr, with an estimate; gives a function of (done, total, text).
+
+    A bar where stderr is a terminal, else plain lines.
 
     Args:
         what: The work, in a word or two.
         quiet: Show nothing at all.
     """
     if quiet:
-        yield lambda done, total: None
+        yield lambda done, total, text="": None
         return
-    lines = lines_on_stderr(what)
-    if lines is not None:
-        yield lines.show
-        return
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(compact=True),
-    )
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(what, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
-
-
-@contextmanager
-def _worded_bar(what: str, *more: ProgressColumn) -> Generator[tuple[Progress, TaskID]]:
-    """A bar of some work beside words on how far it is."""
-    columns = (TextColumn(what), BarColumn(bar_width=24), *more)
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        yield bar, bar.add_task("", total=None, left="")
-
-
-# Weight of the newest view in the figures of the progress line; views differ much.
-_SMOOTHING = 0.02
-
-
-class _Smoothed:
-    """Loss and PSNR of single views, smoothed over many of them."""
-
-    def __init__(self) -> None:
-        self._values: tuple[float, float] | None = None
-
-    def text(self, now: "FitProgress") -> str:
-        """What a line of progress says of a step."""
-        loss, psnr = self._values or (now.loss, now.psnr)
-        loss += _SMOOTHING * (now.loss - loss)
-        psnr += _SMOOTHING * (now.psnr - psnr)
-        self._values = loss, psnr
-        speed = now.step / max(now.seconds, 1e-9)
-        return (
-            f"step {now.step}, loss {loss:.4f}, PSNR {psnr:.2f}, {now.count} Gaussians, "
-            f"{speed:.1f} it/s"
-        )
-
-
-@contextmanager
-def fit_progress() -> Generator["Callable[[FitProgress], None]"]:
-    """Share done, smoothed loss and PSNR, count, speed, estimate."""
-    smoothed = _Smoothed()
-    lines = lines_on_stderr("fit")
-    if lines is not None:
-        yield lambda now: lines.show(
-            now.progress, 1.0, text=smoothed.text(now), seconds_left=now.seconds_left
-        )
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield ProgressLines(what, write=lambda line: tell(sys.stderr, line)).show
         return
     columns = (
-        TextColumn("{task.percentage:>3.0f}%"),
+        TextColumn(what),
+        BarColumn(bar_width=24),
         TextColumn("{task.description}"),
         TimeElapsedColumn(),
-        TextColumn("{task.fields[left]}"),
+        TimeRemainingColumn(compact=True),
     )
-    with _worded_bar("fit", *columns) as (bar, task):
-        shown = 0.0
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task("", total=None)
 
-        def show(now: "FitProgress") -> None:
-            nonlocal shown
-            text = smoothed.text(now)
-            if now.seconds - shown < 0.25:
-                return
-            shown = now.seconds
-            left = f"{now.seconds_left / 60:.1f} min left"
-            bar.update(task, completed=now.progress, total=1.0, description=text, left=left)
+        def show(done: int, total: int, text: str = "") -> None:
+            words = text or f"{done}/{total}"
+            bar.update(task, description=words, completed=done, total=total or None)
 
         yield show
 
 
-@contextmanager
-def pose_progress() -> Generator["Callable[[PoseProgress], None]"]:
-    """The stage and how much of it is done."""
+def named_model(command: Any, option: str, protocol: type[T], does: str) -> T | None:
+    """The model that an option of a command names, see `model_for`; None where it names none.
 
-    def words(now: "PoseProgress") -> str:
-        return f"{now.stage} {now.done}/{now.total}" if now.total else now.stage
+    The command has `Downloads` and `Device` as ``download`` and ``device``.
+    """
+    from splatseg.tasks.see import model_for  # here: most commands need no models
 
-    lines = lines_on_stderr("poses")
-    if lines is not None:
-        # Stages take differently long: there is no estimate of the whole.
-        yield lambda now: lines.show(now.done, None, text=words(now))
-        return
-    with _worded_bar("poses", TextColumn("{task.description}"), TimeElapsedColumn()) as (bar, task):
-        yield lambda now: bar.update(
-            task, description=words(now), completed=now.done, total=now.total or None
-        )
+    named = getattr(command, option)
+    if named is None:
+        return None
+    return model_for(
+        option,
+        named,
+        protocol,
+        does,
+        download=command.download,
+        device=command.device,
+        report=command.observer.note,
+    )
 
 
 def typed(words: Sequence[str]) -> str:
@@ -407,29 +320,9 @@ class ConsoleObserver(Observer):
 
     @override
     @contextmanager
-    def stage(self, stage: str) -> Generator[Callable[[int, int], None]]:
+    def stage(self, stage: str) -> Generator[Step]:
         """A bar or lines for the stage."""
         with progress(stage, quiet=self._quiet) as step:
-            yield step
-
-    @override
-    @contextmanager
-    def fit_stage(self) -> Generator["Callable[[FitProgress], None]"]:
-        """With loss and PSNR."""
-        if self._quiet:
-            yield lambda now: None
-            return
-        with fit_progress() as step:
-            yield step
-
-    @override
-    @contextmanager
-    def pose_stage(self) -> Generator["Callable[[PoseProgress], None]"]:
-        """With the names of its parts."""
-        if self._quiet:
-            yield lambda now: None
-            return
-        with pose_progress() as step:
             yield step
 
     @override

@@ -103,7 +103,7 @@ KINDS = {"segment": "--method", "see": "--model"}
 """Commands whose options depend on the value of one of them."""
 
 
-def kept_page(name: str, words: Sequence[str]) -> str | None:
+def stored_page(name: str, words: Sequence[str]) -> str | None:
     """The page that answers the words of a command, None where it must be made.
 
     Args:
@@ -129,7 +129,7 @@ def kept_page(name: str, words: Sequence[str]) -> str | None:
     return path.read_text(encoding="utf-8")
 
 
-def made_page(name: str, entry: "CommandEntry", words: Sequence[str] = ()) -> str:
+def rendered_page(name: str, entry: "CommandEntry", words: Sequence[str] = ()) -> str:
     """The help of a command, 80 columns wide.
 
     Args:

@@ -21,8 +21,8 @@ class Command(Printing):
     Photographs of the room and class maps with a network's mistakes are generated; then fit, see,
     segment, render, evaluate and export run on them, and each command is printed: classes from
     the maps, objects from masks that need no weights, renders of held-out views, files and
-    reports. Takes about three minutes on two cores. report.html and contact_sheet.png in DIR show
-    the results.
+    reports. Takes about three minutes on two cores. DIR/scene/reports has a page of the fit and
+    one of each layer, with the truth beside it.
 
     For example:
 
@@ -57,27 +57,25 @@ def run(command: Command) -> None:
 
 
 def _print_tables(made: Demo) -> None:
-    console, figures = Console(highlight=False), made.figures
+    console = Console(highlight=False)
     console.print()
     scores = Table("labels", "views", "mIoU", "accuracy", title="Class maps against the truth")
     for column in scores.columns[2:]:
         column.justify = "right"
-    came: Mapping[str, float] = {"mIoU": figures.came.miou, "accuracy": figures.came.accuracy}
+    came: Mapping[str, float] = {"mIoU": made.came.miou, "accuracy": made.came.accuracy}
+    test, objects = made.figures["semantic", "test"], made.figures["objects", "test"]
     for what, views, row in (
         ("as they came", "train", came),
-        ("lifted and rendered", "train", figures.train),
-        ("lifted and rendered", "held out", figures.test),
+        ("lifted and rendered", "train", made.figures["semantic", "train"]),
+        ("lifted and rendered", "held out", test),
     ):
         scores.add_row(what, views, f"{row['mIoU']:.3f}", f"{row['accuracy']:.3f}")
     console.print(scores)
-    views = counted(figures.test["photographs"], "held-out view")
+    views = counted(test["photographs"], "held-out view")
+    console.print(f"Renders of {views}: PSNR {test['PSNR']:.2f} dB, SSIM {test['SSIM']:.3f}")
     console.print(
-        f"Renders of {views}: PSNR {figures.test['PSNR']:.2f} dB, SSIM {figures.test['SSIM']:.3f}"
-    )
-    console.print(
-        f"Objects from masks without weights: {figures.objects['predicted_instances']} for "
-        f"{figures.objects['truth_instances']} true ones, mIoU {figures.objects['mIoU']:.3f} "
-        "held out"
+        f"Objects from masks without weights: {objects['predicted_instances']} for "
+        f"{objects['truth_instances']} true ones, mIoU {objects['mIoU']:.3f} held out"
     )
     seconds: Mapping[str, float] = made.record["seconds"]
     times = Table("step", "seconds", title=f"{made.record['seconds_total']:.0f} s in all")
@@ -85,4 +83,5 @@ def _print_tables(made: Demo) -> None:
     for name, value in seconds.items():
         times.add_row(name, f"{value:.1f}")
     console.print(times)
-    print_result({}, ["", f"Open {made.folder / 'report.html'} in a browser."], json=False)
+    pages = " and ".join(str(page) for page in made.reports)
+    print_result({}, ["", f"Open {pages} in a browser."], json=False)

@@ -9,7 +9,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from splatseg.cli._shared import Field, OnScene, Split, plain, print_result
+from splatseg.cli._shared import Field, OnScene, plain, print_result
 from splatseg.core import Scene
 from splatseg.io.json_files import write_json
 from splatseg.tasks import EvaluationOptions, evaluate_scene
@@ -22,11 +22,6 @@ _PER_CLASS = {
     "AP50_per_class": "average precision of each class of things",
     "points_per_class": "classes of points",
 }
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Options(EvaluationOptions):
-    split: Split = "test"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +44,7 @@ class Command(OnScene):
     splatseg evaluate room --split train
     """
 
-    scoring: tyro.conf.OmitArgPrefixes[_Options] = field(default_factory=_Options)
+    scoring: tyro.conf.OmitArgPrefixes[EvaluationOptions] = field(default_factory=EvaluationOptions)
     """What is scored, and the truth."""
 
     field: Field = None

@@ -8,13 +8,8 @@ from typing import Annotated
 import tyro
 
 from splatseg.cli._shared import (
-    Frames,
-    Linear,
     OnScene,
-    Overwrite,
     Printing,
-    SplitOrPath,
-    Strict,
     print_result,
 )
 from splatseg.lift import MatchOptions
@@ -26,12 +21,6 @@ from splatseg.tasks import (
     export_scene,
 )
 from splatseg.tasks.export_labels import What
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Export(ExportOptions):
-    split: SplitOrPath = "test"
-    frames: Frames = 360
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,7 +52,7 @@ class Command(OnScene):
     what: What = "splat"
     """What to write: splat, objects, points, coco or table."""
 
-    export: tyro.conf.OmitArgPrefixes[_Export] = field(default_factory=_Export)
+    export: tyro.conf.OmitArgPrefixes[ExportOptions] = field(default_factory=ExportOptions)
     """Layers to export, and formats."""
 
 
@@ -89,13 +78,6 @@ def run(command: Command) -> None:
     if done.table is not None:
         lines.append(f"what the ids mean in {done.table}")
     print_result(facts, lines, json=command.json)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Attach(AttachLayersOptions):
-    strict: Strict = False
-    linear: Linear = ()
-    overwrite: Overwrite = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,7 +115,9 @@ class AttachCommand(Printing):
     """Scene folder to write, which must not exist yet, or a .ply file. Not needed where FILE is a
     scene folder."""
 
-    attaching: Annotated[_Attach, tyro.conf.arg(name="")] = field(default_factory=_Attach)
+    attaching: Annotated[AttachLayersOptions, tyro.conf.arg(name="")] = field(
+        default_factory=AttachLayersOptions
+    )
     """Layers to attach, and how much must be found."""
 
     search: MatchOptions = field(default_factory=MatchOptions)

@@ -10,13 +10,9 @@ import tyro
 
 from splatseg.cli._shared import (
     Backend,
-    Format,
-    Linear,
-    MadeSceneFolder,
-    Overwrite,
+    NewSceneFolder,
     Printing,
     Seed,
-    Strict,
     print_result,
     typed,
 )
@@ -25,13 +21,6 @@ from splatseg.report.fit_report import scored_of
 from splatseg.tasks import ImportOptions, MadeScene, MakeSceneOptions, fit_capture, import_scene
 
 _DEFAULT = FitOptions()
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Scene(MakeSceneOptions):
-    format: Format = "auto"
-    strict: Strict = False
-    overwrite: Overwrite = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +43,7 @@ class Command(Printing):
     """The capture: a folder of COLMAP, nerfstudio, Blender, LLFF or IDR data, a folder of bare
     photographs, or a video."""
 
-    output: MadeSceneFolder
+    output: NewSceneFolder
 
     minutes: float | None = None
     """Length of the optimisation, minutes. Finding poses comes before it and is not counted; scores
@@ -111,7 +100,9 @@ class Command(Printing):
     seed: Seed = 0
     backend: Backend = "auto"
 
-    capture: Annotated[_Scene, tyro.conf.arg(name="")] = field(default_factory=_Scene)
+    capture: Annotated[MakeSceneOptions, tyro.conf.arg(name="")] = field(
+        default_factory=MakeSceneOptions
+    )
     """How photographs are read, where cameras come from, and how a stopped fit goes on."""
 
 
@@ -202,13 +193,6 @@ def _lines(made: MadeScene) -> list[str]:
     ]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Import(ImportOptions):
-    format: Format = "auto"
-    strict: Strict = False
-    linear: Linear = ()
-
-
 @dataclass(frozen=True, kw_only=True)
 class ImportCommand(Printing):
     """Make a scene of a splat file, with its photographs or with virtual cameras.
@@ -230,9 +214,11 @@ class ImportCommand(Printing):
     file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
     """The splat file: PLY, compressed PLY, .splat, SPZ, SOG or glTF."""
 
-    output: MadeSceneFolder
+    output: NewSceneFolder
 
-    importing: Annotated[_Import, tyro.conf.arg(name="")] = field(default_factory=_Import)
+    importing: Annotated[ImportOptions, tyro.conf.arg(name="")] = field(
+        default_factory=ImportOptions
+    )
     """The capture, or virtual cameras."""
 
     backend: Backend = "auto"

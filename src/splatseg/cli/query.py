@@ -9,21 +9,28 @@ from typing import Annotated, Any
 
 import tyro
 
-from splatseg.cli._shared import Device, Downloads, Frames, OnScene, print_result, typed
+from splatseg.cli._shared import (
+    Device,
+    Downloads,
+    Frames,
+    OnScene,
+    named_model,
+    print_result,
+    typed,
+)
 from splatseg.core import Scene, View
 from splatseg.core.models import TextFeatures
 from splatseg.errors import InputError
 from splatseg.io.scene import check_name, save_scene_layer
 from splatseg.io.scene_folder import work_on_scene
 from splatseg.tasks import (
-    Answers,
     QueryOptions,
+    QueryResult,
     QuerySession,
-    draw_answers,
     draw_heat,
+    draw_query_result,
     write_query_report,
 )
-from splatseg.tasks.see import model_for
 from splatseg.tasks.work import Work
 
 _LISTED = 5
@@ -109,17 +116,7 @@ def run(command: Command) -> None:
         check_name("layer", command.layer)
     scene = command.open()
     views = _views(command, scene)
-    encoder = None
-    if command.model is not None:
-        encoder = model_for(
-            "model",
-            command.model,
-            TextFeatures,
-            "encodes words, such as clip",
-            download=command.download,
-            device=command.device,
-            report=observer.note,
-        )
+    encoder = named_model(command, "model", TextFeatures, "encodes words, such as clip")
     writes = ["layers", *(["reports"] if command.report else [])]
     with work_on_scene(command.scene, "query", writes=writes):
         session = QuerySession(
@@ -165,7 +162,7 @@ def _views(command: Command, scene: Scene) -> tuple[View, ...]:
     return Work(scene=scene).views(command.views, frames=command.frames)
 
 
-def _answered(answers: Answers, top: int) -> tuple[dict[str, Any], list[str]]:
+def _answered(answers: QueryResult, top: int) -> tuple[dict[str, Any], list[str]]:
     facts: dict[str, Any] = {
         "source": answers.layer,
         "words": {},
@@ -192,11 +189,11 @@ def _answered(answers: Answers, top: int) -> tuple[dict[str, Any], list[str]]:
 
 
 def _drawn(
-    command: Command, scene: Scene, answers: Answers, views: tuple[View, ...]
+    command: Command, scene: Scene, answers: QueryResult, views: tuple[View, ...]
 ) -> Iterator[tuple[str, Path, tuple[Path, ...]]]:
     """What is drawn, by its name: the folder and the files."""
     if command.picture is not None:
-        files = draw_answers(
+        files = draw_query_result(
             answers, scene, command.picture, top=command.top, backend=command.backend
         )
         yield "pictures", command.picture, files

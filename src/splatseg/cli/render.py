@@ -7,19 +7,13 @@ from typing import Annotated
 
 import tyro
 
-from splatseg.cli._shared import Field, Frames, OnScene, SplitOrPath, print_result
+from splatseg.cli._shared import Field, OnScene, print_result
 from splatseg.errors import InputError
 from splatseg.evaluate import PointSurfaceOptions
 from splatseg.io.captures import read_capture
 from splatseg.io.scene_folder import is_scene
 from splatseg.tasks import Rendering, RenderingOptions, render_truth, render_views
 from splatseg.tasks.work import scene_field
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Rendering(RenderingOptions):
-    split: SplitOrPath = "test"
-    frames: Frames = 360
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +45,9 @@ class Command(OnScene):
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="DIR")]
     """Folder to write to. DIR/<what> of an earlier render is replaced as a whole."""
 
-    rendering: Annotated[_Rendering, tyro.conf.arg(name="")] = field(default_factory=_Rendering)
+    rendering: Annotated[RenderingOptions, tyro.conf.arg(name="")] = field(
+        default_factory=RenderingOptions
+    )
     """Views, and what is drawn of them."""
 
     field: Field = None

@@ -6,12 +6,12 @@ from typing import Annotated, Any
 
 import tyro
 
-from splatseg.cli._shared import OnScene, Overwrite, print_result
+from splatseg.cli._shared import OnScene, print_result
 from splatseg.cli._words import option_value
 from splatseg.models import (
+    DescribedEvidence,
     LoadOptions,
     ModelFamily,
-    SeenEvidence,
     TrackingOptions,
     find_family,
     model_names,
@@ -21,11 +21,6 @@ from splatseg.tasks import SeeOptions, see
 
 CONFIG = (tyro.conf.HelptextFromCommentsOff,)
 """Options of the model and of its weights are flags without a prefix."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _See(SeeOptions):
-    overwrite: Overwrite = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,7 +56,7 @@ class Command(OnScene):
     evidence: Annotated[str, tyro.conf.arg(metavar="NAME")]
     """Name of the evidence to write."""
 
-    seeing: tyro.conf.OmitArgPrefixes[_See] = field(default_factory=_See)
+    seeing: tyro.conf.OmitArgPrefixes[SeeOptions] = field(default_factory=SeeOptions)
     """What to predict, of which views, and how recorded predictions are read."""
 
     loading: tyro.conf.OmitArgPrefixes[LoadOptions] = field(default_factory=LoadOptions)
@@ -88,7 +83,7 @@ _Untracked = make_dataclass(
             field(default_factory=TrackingOptions),
         ),
     ],
-    bases=(_See,),
+    bases=(SeeOptions,),
     frozen=True,
     kw_only=True,
 )
@@ -186,7 +181,7 @@ def run(command: Command) -> None:
     print_result(facts, lines, json=command.json)
 
 
-def summary(seen: SeenEvidence) -> str:
+def summary(seen: DescribedEvidence) -> str:
     """One line on what was written."""
     new = seen.views - seen.kept
     parts = [f"{seen.kind} of {seen.views} views by {seen.model}"]

@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar
 
 import tyro
 
-from splatseg.cli._shared import OnScene, Overwrite, Seed, print_result, typed
+from splatseg.cli._shared import OnScene, print_result, typed
 from splatseg.cli._words import option_value
 from splatseg.core import UNLABELLED, Features, Selection, VoxelFeatures
 from splatseg.core.instance_tree import layer_kind
@@ -34,27 +34,17 @@ CONFIG = (tyro.conf.HelptextFromCommentsOff,)
 """Options of the method and the shared ones are flags without a prefix."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Shared(SegmentOptions):
-    seed: Seed = 0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Checkpoints(CheckpointOptions):
-    overwrite: Overwrite = False
-
-
 _HIDDEN_CHECKPOINTS = (
     "checkpoint",
-    Annotated[_Checkpoints, tyro.conf.OmitArgPrefixes, tyro.conf.Suppress],
-    field(default_factory=_Checkpoints),
+    Annotated[CheckpointOptions, tyro.conf.OmitArgPrefixes, tyro.conf.Suppress],
+    field(default_factory=CheckpointOptions),
 )
 """The flags of trainings for a method that does not train: not in its help, and refused by the
 task, which says why."""
 
 
 _COMPLETION = (
-    "neighbours", "spread_steps", "own_evidence", "min_inferred", "colour_width", "feature_width",
+    "neighbours", "spread_steps", "train_evidence", "min_inferred", "colour_width", "feature_width",
     "smoothing", "smoothing_steps", "completed_layer",
 )  # fmt: skip
 
@@ -85,7 +75,7 @@ class Command(OnScene):
     method: Annotated[str, tyro.conf.arg(metavar="METHOD")]
     """Method to use. `splatseg segment --method METHOD --help` shows its options."""
 
-    shared: tyro.conf.OmitArgPrefixes[_Shared] = field(default_factory=_Shared)
+    shared: tyro.conf.OmitArgPrefixes[SegmentOptions] = field(default_factory=SegmentOptions)
     """Options that all methods share."""
 
     export: bool = False
@@ -99,7 +89,9 @@ class Command(OnScene):
     truth: Path | None = None
     """Folder of true maps, which are shown and scored in the report."""
 
-    checkpoint: tyro.conf.OmitArgPrefixes[_Checkpoints] = field(default_factory=_Checkpoints)
+    checkpoint: tyro.conf.OmitArgPrefixes[CheckpointOptions] = field(
+        default_factory=CheckpointOptions
+    )
     """How a stopped training goes on."""
 
     options: Any = None
@@ -141,7 +133,7 @@ def _shared_with(differs: str) -> tuple[str, Any, Any]:
     said = f"Use the method's published setting: the authors' options, no completion. {differs}"
     told = Annotated[bool, tyro.conf.arg(help=said)]
     shared = make_dataclass(
-        "Shared", [("published", told, field(default=False))], bases=(_Shared,), frozen=True,
+        "Shared", [("published", told, field(default=False))], bases=(SegmentOptions,), frozen=True,
         kw_only=True,
     )  # fmt: skip
     return "shared", tyro.conf.OmitArgPrefixes[shared], field(default_factory=shared)

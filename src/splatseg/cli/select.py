@@ -12,7 +12,7 @@ import torch
 import tyro
 from torch import Tensor
 
-from splatseg.cli._shared import Device, Downloads, OnScene, Seed, print_result
+from splatseg.cli._shared import Device, Downloads, OnScene, named_model, print_result
 from splatseg.core import PromptableMasks, Scene, Selection, View
 from splatseg.core.instance_tree import layer_kind
 from splatseg.core.models import GroundedMasks, TextFeatures
@@ -44,7 +44,7 @@ from splatseg.tasks import (
     select_text,
     text_prompts,
 )
-from splatseg.tasks.see import model_for, prompter_of
+from splatseg.tasks.see import prompter_of
 from splatseg.tasks.work import Work
 
 _T = TypeVar("_T")
@@ -63,7 +63,6 @@ class _Options(SelectOptions):
     (objects) to 1 (the finest parts). auto: chosen by the source."""
 
     mode: Annotated[SelectMode, tyro.conf.Suppress] = "new"
-    seed: Seed = 0
 
 
 _Repeated = tyro.conf.UseAppendAction
@@ -292,29 +291,14 @@ def _by_text(
         ),
         select_options=options,
         models=TextModels(
-            grounder=_model(command, "grounder", GroundedMasks, "finds words in images"),
+            grounder=named_model(command, "grounder", GroundedMasks, "finds words in images"),
             prompter=prompter,
-            encoder=_model(command, "encoder", TextFeatures, "encodes words"),
+            encoder=named_model(command, "encoder", TextFeatures, "encodes words"),
         ),
         places=places,
         base=base,
         backend=command.backend,
         observer=command.observer,
-    )
-
-
-def _model(command: Command, option: str, protocol: type[_T], does: str) -> _T | None:
-    named = getattr(command, option)
-    if named is None:
-        return None
-    return model_for(
-        option,
-        named,
-        protocol,
-        does,
-        download=command.download,
-        device=command.device,
-        report=command.observer.note,
     )
 
 

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from splatseg.cli._shared import Backend, Data, Overwrite, Printing, Seed, print_result, typed
+from splatseg.cli._shared import Backend, Data, Overwrite, Printing, print_result, typed
 from splatseg.errors import InputError
 from splatseg.io.scene import scene_field_path
 from splatseg.report.words import counted
@@ -27,11 +27,6 @@ from splatseg.tasks import (
 )
 
 CONFIG = (tyro.conf.HelptextFromCommentsOff,)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Street(StreetOptions):
-    seed: Seed = 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,7 +60,7 @@ class Command(Printing):
     new_scene: Annotated[Path | None, tyro.conf.arg(metavar="NEW")] = None
     """With a capture: the scene folder to write, without Gaussians."""
 
-    inputs: tyro.conf.OmitArgPrefixes[_Street] = field(default_factory=_Street)
+    inputs: tyro.conf.OmitArgPrefixes[StreetOptions] = field(default_factory=StreetOptions)
     """Inputs of the field."""
 
     primitives: tyro.conf.OmitArgPrefixes[DnmpOptions] = field(default_factory=DnmpOptions)

@@ -6,7 +6,8 @@ code without either.
 
     tensors     Float[Tensor, "n 3"]: tensors, arrays, lists of numbers, see `coerce`. A last axis
                 called ``channels`` may be left out where there is one; (H, W) is taken for
-                ``height width 3``, three times the same
+                ``height width 3``, three times the same. Axes are those of the annotation, and
+                of the fields of a class axes of one name have one length
     numbers     int, float, bool: Python's, NumPy's, tensors of one
     paths       Path: paths and text
     values      any class: an instance of it
@@ -34,6 +35,7 @@ from jaxtyping import AbstractArray
 from msgspec import Meta
 from torch import Tensor
 
+from splatseg._check import check_shape
 from splatseg.core.coerce import (
     Kind,
     as_any_tensor,
@@ -111,17 +113,42 @@ def convert_fields(value: Any) -> None:
     Raises:
         InputError: If a field cannot be what it should be.
     """
-    for name, convert in _field_converters(type(value)):
+    lengths: dict[str, int] = {}
+    for name, convert, axes in _field_converters(type(value)):
         given = getattr(value, name)
         made = convert(name, given)
         if made is not given:
             object.__setattr__(value, name, made)
+        if axes and made is not None:
+            pairs = list(zip(axes, made.shape, strict=True))
+            check_shape(name, made, [lengths.get(axis, length) for axis, length in pairs])
+            lengths.update(pairs)
 
 
 @functools.cache
-def _field_converters(owner: type[Any]) -> tuple[tuple[str, Converter], ...]:
+def _field_converters(owner: type[Any]) -> tuple[tuple[str, Converter, tuple[str, ...]], ...]:
+    """Name, converter and axes of the fields that have a converter."""
+    hints = _hints(owner)
     names = tuple(field.name for field in fields(owner))
-    return tuple(converters(owner, names).items())
+    return tuple((n, c, _axes_of(hints[n])) for n, c in converters(owner, names).items())
+
+
+def _hints(owner: Any) -> dict[str, Any]:
+    # JSON's alias is text that names what the module of the annotation may not import.
+    known = {"JSON": object, "Sequence": Sequence, "Mapping": Mapping}
+    return typing.get_type_hints(owner, localns=known, include_extras=True)
+
+
+def _axes_of(annotation: Any) -> tuple[str, ...]:
+    """Axes of a tensor, which may be None; empty where the annotation does not fix them."""
+    is_union = typing.get_origin(annotation) in (Union, types.UnionType)
+    found = {
+        member.dim_str
+        for member in (typing.get_args(annotation) if is_union else (annotation,))
+        if isinstance(member, type) and issubclass(member, AbstractArray)
+    }
+    axes = tuple(found.pop().split()) if len(found) == 1 else ()
+    return axes if all(a.isidentifier() or a.isdecimal() for a in axes) else ()
 
 
 def converters(owner: Any, names: tuple[str, ...]) -> dict[str, Converter]:
@@ -129,9 +156,7 @@ def converters(owner: Any, names: tuple[str, ...]) -> dict[str, Converter]:
 
     A converter takes the name, for the error, and the value. Names that may be anything have none.
     """
-    # JSON's alias is text that names what the module of the annotation may not import.
-    known = {"JSON": object, "Sequence": Sequence, "Mapping": Mapping}
-    hints = typing.get_type_hints(owner, localns=known, include_extras=True)
+    hints = _hints(owner)
     found = {name: _converter(hints[name]) for name in names if name in hints}
     return {name: convert for name, convert in found.items() if convert is not None}
 
@@ -243,6 +268,8 @@ def _one_of(members: tuple[Any, ...]) -> Converter | None:
                 errors.append(error)
         if made:
             return next((one for one in made if one is value), made[0])
+        if misshapen := next((one for one in errors if isinstance(one, ShapeError)), None):
+            raise misshapen
         words = " or ".join(dict.fromkeys(_called(member) for member, _ in attempts))
         raise InputError(f"{name}: expected {words}, got {describe(value)}.") from errors[0]
 
@@ -411,9 +438,6 @@ def _tensor_of(annotation: Any) -> Converter | None:
                     "if these are no ids, x / 255 for pixels."
                 )
             tensor = as_tensor(name, tensor, kind)
-        if axes and fixed and not tensor.ndim:
-            shown = ", ".join(axis if axis.isdecimal() else "any" for axis in axes)
-            raise ShapeError(f"{name}: expected shape ({shown}), got ().")
         if fixed and axes and tensor.ndim == len(axes) - 1 > 0:
             if axes[-1] == "channels":
                 return tensor.unsqueeze(-1)
@@ -424,6 +448,8 @@ def _tensor_of(annotation: Any) -> Converter | None:
                 f"{name}: expected an image (height, width, 3) of at least a pixel, "
                 f"got {tuple(tensor.shape)}."
             )
+        if fixed and axes:
+            check_shape(name, tensor, [int(a) if a.isdecimal() else None for a in axes])
         return tensor
 
     return convert

@@ -70,7 +70,6 @@ class Camera:
         padded = tuple(float(v) for v in self.distortion) + (0.0,) * count
         object.__setattr__(self, "distortion", padded[:count])
         pose = self.cam_from_world
-        check_shape("cam_from_world", pose, (4, 4))
         check_finite("cam_from_world", pose)
         check_rotation("cam_from_world", pose[:3, :3])
         if pose[3].detach().tolist() != [0.0, 0.0, 0.0, 1.0]:

@@ -15,6 +15,7 @@ from typing import Any, Final, cast
 
 from splatseg.core.boundary import convert_fields
 from splatseg.core.options import Count, Positive
+from splatseg.errors import OutputError
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []))
 # This signal interrupts at once: the step in progress may never end.
@@ -130,11 +131,6 @@ class Checkpoints:
         convert_fields(self)
 
 
-def without_checkpoint(error: Exception) -> str:
-    """The sentence about a checkpoint that could not be written."""
-    return f"{str(error).rstrip('.')}; the work goes on, but has no checkpoint of now"
-
-
 class CheckpointSchedule:
     """Tracks when the next checkpoint is due.
 
@@ -152,10 +148,17 @@ class CheckpointSchedule:
             return steps % self._checkpoints.steps == 0
         return time.monotonic() >= self._due
 
-    def written(self, seconds: float) -> None:
-        """One has just been written, which took so many seconds."""
-        pause = max(self._checkpoints.seconds, _MIN_PAUSE_RATIO * seconds)
-        self._due = time.monotonic() + pause
+    def write(self, save: Callable[[], None]) -> float:
+        """Write one, or tell that it cannot be. Returns the seconds it took."""
+        begin = time.monotonic()
+        try:
+            save()
+        except OutputError as error:
+            sentence = str(error).rstrip(".")
+            self._checkpoints.failed(f"{sentence}; the work goes on, but has no checkpoint of now")
+        now = time.monotonic()
+        self._due = now + max(self._checkpoints.seconds, _MIN_PAUSE_RATIO * (now - begin))
+        return now - begin
 
 
 # Options are recorded as they stand in a file's JSON. Programs grow: an option that a record does

@@ -47,7 +47,6 @@ class Edited:
             raise RangeError(f"rows: expected -1 or more, got {int(self.rows.min())}.")
         object.__setattr__(self, "rows", self.rows.to(torch.int64))
         if self.fractions is not None:
-            check_shape("fractions", self.fractions, (len(self.rows),))
             check_values("fractions", self.fractions, 0.0, 1.0)
 
     def __len__(self) -> int:

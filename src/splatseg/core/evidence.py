@@ -63,7 +63,6 @@ class Rle:
     @boundary
     def encode(cls, mask: Bool[Tensor, "height width"]) -> "Rle":
         """Run lengths of a boolean mask."""
-        check_shape("mask", mask, (None, None))
         height, width = (int(s) for s in mask.shape)
         flat = mask.to(torch.bool).cpu().numpy().T.reshape(-1)
         changes = np.flatnonzero(flat[1:] != flat[:-1]) + 1
@@ -160,7 +159,6 @@ class MaskSet(Previewed):
         convert_fields(self)
         check_shape("scores", self.scores, (len(self.masks),))
         check_finite("scores", self.scores)
-        check_shape("levels", self.levels, (len(self.masks),))
         for i, mask in enumerate(self.masks):
             if (mask.height, mask.width) != (self.height, self.width):
                 raise ShapeError(
@@ -191,7 +189,6 @@ class MaskSet(Previewed):
         levels: Sequence[int] | Tensor | None = None,
     ) -> "MaskSet":
         """Encode boolean masks; scores default to 1 and levels to 0."""
-        check_shape("masks", masks, (None, None, None))
         count, height, width = (int(s) for s in masks.shape)
         return cls(
             height=height,
@@ -218,12 +215,9 @@ class LabelMap(Previewed):
 
     def __post_init__(self) -> None:
         convert_fields(self)
-        check_shape("ids", self.ids, (None, None))
         if self.ids.numel() and int(self.ids.min()) < UNLABELLED:
             raise RangeError(f"ids: expected -1 or more, got {int(self.ids.min())}.")
         object.__setattr__(self, "ids", self.ids.to(torch.int32))
-        if self.confidence is not None:
-            check_shape("confidence", self.confidence, tuple(self.ids.shape))
 
     def __repr__(self) -> str:
         present = torch.unique(self.ids)
@@ -261,7 +255,6 @@ class FeatureMap:
 
     def __post_init__(self) -> None:
         convert_fields(self)
-        check_shape("features", self.features, (None, None, None))
 
     def __repr__(self) -> str:
         rows, columns, channels = self.features.shape
@@ -289,10 +282,8 @@ class DepthMap:
 
     def __post_init__(self) -> None:
         convert_fields(self)
-        check_shape("values", self.values, (None, None))
         check_values("values", self.values, 0.0, math.inf)
         if self.confidence is not None:
-            check_shape("confidence", self.confidence, tuple(self.values.shape))
             check_values("confidence", self.confidence, 0.0, 1.0)
 
     def __repr__(self) -> str:
@@ -343,7 +334,7 @@ class Track:
 
 @boundary
 def map_ids(
-    ids: Int[Tensor, "height width"],
+    ids: Int[Tensor, "..."],
     values: Mapping[int, float],
     *,
     default: float | None,

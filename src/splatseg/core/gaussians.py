@@ -18,7 +18,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splatseg._check import check_finite, check_shape, check_values
+from splatseg._check import check_finite, check_values
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.coerce import as_rows
 from splatseg.core.rigid import Similarity, quaternion_from_rotation, quaternion_multiply
@@ -120,12 +120,7 @@ class Gaussians(Previewed):
 
     def __post_init__(self) -> None:
         convert_fields(self)
-        n = self.means.shape[0] if self.means.ndim else 0
-        check_shape("means", self.means, (None, 3))
-        check_shape("rotations", self.rotations, (n, 4))
-        check_shape("scales", self.scales, (n, 3))
-        check_shape("opacities", self.opacities, (n,))
-        check_shape("sh", self.sh, (n, None, 3))
+        n = len(self.means)
         degree_of(self.sh.shape[1])
         for name, column in self.extra.items():
             if column.ndim not in (1, 2) or column.shape[0] != n:

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from splatseg._check import check_finite, check_shape, check_values
+from splatseg._check import check_finite, check_values
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.coerce import as_rows
 from splatseg.core.evidence import UNLABELLED
@@ -91,20 +91,11 @@ class Labels(RowColumns, Previewed):
 
     def __post_init__(self) -> None:
         convert_fields(self)
-        check_shape("ids", self.ids, (None,))
-        n = len(self.ids)
-        check_shape("confidence", self.confidence, (n,))
-        if n and int(self.ids.min()) < UNLABELLED:
+        if len(self.ids) and int(self.ids.min()) < UNLABELLED:
             raise RangeError(f"ids: expected -1 or more, got {int(self.ids.min())}.")
         object.__setattr__(self, "ids", self.ids.to(torch.int32))
         if (self.candidates is None) != (self.shares is None):
             raise InputError("candidates, shares: expected both or neither, got one of them.")
-        if self.candidates is not None and self.shares is not None:
-            check_shape("candidates", self.candidates, (n, None))
-            check_shape("shares", self.shares, tuple(self.candidates.shape))
-        for name in _OF_EVIDENCE:
-            if getattr(self, name) is not None:
-                check_shape(name, getattr(self, name), (n,))
         for name in ("confidence", "shares", "evidence", "effective_views"):
             if getattr(self, name) is not None:
                 check_finite(name, getattr(self, name))
@@ -147,9 +138,7 @@ class Features(RowColumns):
 
     def __post_init__(self) -> None:
         convert_fields(self)
-        check_shape("values", self.values, (None, None))
         if self.weights is not None:
-            check_shape("weights", self.weights, (len(self.values),))
             check_finite("weights", self.weights)
         check_finite("values", self.values)
 
@@ -198,9 +187,7 @@ class Selection(RowColumns):
 
     def __post_init__(self) -> None:
         convert_fields(self)
-        check_shape("mask", self.mask, (None,))
         if self.confidence is not None:
-            check_shape("confidence", self.confidence, (len(self.mask),))
             check_values("confidence", self.confidence, 0, 1)
             # 0.5 itself may be on either side: it is its own complement.
             wrong = torch.where(self.mask, self.confidence < 0.5, self.confidence > 0.5)

@@ -28,11 +28,9 @@ def signs_of_points(points: Tensor, positive: Tensor | None) -> Tensor:
         ShapeError: If points are not p x 2, or signs are not of p points.
         RangeError: If a coordinate is not finite.
     """
-    check_shape("points", points, (None, 2))
     check_finite("points", points)
     if positive is None:
         return torch.ones(len(points), dtype=torch.bool)
-    check_shape("positive", positive, (len(points),))
     return positive.to(torch.bool)
 
 
@@ -56,7 +54,6 @@ class Prompt:
         convert_fields(self)
         object.__setattr__(self, "positive", signs_of_points(self.points, self.positive))
         if self.box is not None:
-            check_shape("box", self.box, (4,))
             check_finite("box", self.box)
             x0, y0, x1, y1 = self.box.tolist()
             if not (x0 < x1 and y0 < y1):
@@ -326,7 +323,6 @@ class Boxes:
     def __post_init__(self) -> None:
         convert_fields(self)
         check_shape("boxes", self.boxes, (len(self.words), 4))
-        check_shape("scores", self.scores, (len(self.words),))
         check_finite("boxes", self.boxes)
         check_finite("scores", self.scores)
 
@@ -405,8 +401,6 @@ class Pointmap:
 
     def __post_init__(self) -> None:
         convert_fields(self)
-        check_shape("points", self.points, (None, None, 3))
-        check_shape("confidence", self.confidence, tuple(self.points.shape[:2]))
         check_finite("points", self.points)
         check_values("confidence", self.confidence, 1.0, math.inf)
 

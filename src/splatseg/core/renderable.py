@@ -13,7 +13,7 @@ from typing import Literal, Protocol, Self, runtime_checkable
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from splatseg._check import check_finite, check_shape
+from splatseg._check import check_finite
 from splatseg.core.boundary import convert_fields
 from splatseg.core.camera import Camera
 from splatseg.core.evidence import UNLABELLED, LabelMap
@@ -41,13 +41,6 @@ class ViewSignals:
 
     def __post_init__(self) -> None:
         convert_fields(self)
-        check_shape("alpha", self.alpha, (None, None))
-        size = tuple(self.alpha.shape)
-        check_shape("depth", self.depth, size)
-        if self.colour is not None:
-            check_shape("colour", self.colour, (*size, 3))
-        if self.median_depth is not None:
-            check_shape("median_depth", self.median_depth, size)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -62,8 +55,6 @@ class PointLabels:
 
     def __post_init__(self) -> None:
         convert_fields(self)
-        check_shape("ids", self.ids, (None,))
-        check_shape("confidence", self.confidence, (len(self.ids),))
         check_finite("confidence", self.confidence)
 
 

@@ -135,7 +135,6 @@ class Similarity:
     def __post_init__(self) -> None:
         convert_fields(self)
         check_rotation("rotation", self.rotation)
-        check_shape("translation", self.translation, (3,))
         check_finite("translation", self.translation)
 
     @classmethod

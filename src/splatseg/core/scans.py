@@ -44,7 +44,6 @@ class LabelledMesh:
     def __post_init__(self) -> None:
         convert_fields(self)
         object.__setattr__(self, "vertices", _positions("vertices", self.vertices))
-        check_shape("faces", self.faces, (None, 3))
         if not len(self.faces):
             raise InputError("faces: expected at least one triangle, got none.")
         faces = self.faces.cpu().long()
@@ -102,7 +101,6 @@ class LabelledPoints:
             raise InputError("points: expected at least one point, got none.")
         object.__setattr__(self, "labels", checked_labels("labels", self.labels, len(self.points)))
         if self.normals is not None:
-            check_shape("normals", self.normals, (len(self.points), 3))
             object.__setattr__(self, "normals", _positions("normals", self.normals))
 
     def __len__(self) -> int:
@@ -113,7 +111,6 @@ class LabelledPoints:
 
 
 def _positions(name: str, values: Tensor) -> Tensor:
-    check_shape(name, values, (None, 3))
     check_finite(name, values)
     return values.detach().cpu().double()
 
@@ -172,19 +169,15 @@ class Scan:
 
     def __post_init__(self) -> None:
         convert_fields(self)
-        check_shape("points", self.points, (None, 3))
         check_finite("points", self.points)
         count = len(self.points)
         object.__setattr__(self, "points", self.points.detach().cpu().double())
         if self.origin is not None:
-            check_shape("origin", self.origin, (3,))
             check_finite("origin", self.origin)
             object.__setattr__(self, "origin", self.origin.detach().cpu().double())
         if self.intensity is not None:
-            check_shape("intensity", self.intensity, (count,))
             object.__setattr__(self, "intensity", self.intensity.detach().cpu().float())
         if self.rows is not None:
-            check_shape("rows", self.rows, (count,))
             object.__setattr__(self, "rows", self.rows.detach().cpu().long())
         object.__setattr__(self, "labels", checked_labels("labels", self.labels, count))
 
@@ -279,9 +272,7 @@ class MovingBox:
 
     def __post_init__(self) -> None:
         convert_fields(self)
-        check_shape("centre", self.centre, (3,))
         check_finite("centre", self.centre)
-        check_shape("rotation", self.rotation, (4,))
         if not self.start <= self.end:
             raise RangeError(
                 f"start, end: expected a span of time, got {self.start:g} to {self.end:g}."
@@ -317,7 +308,6 @@ def inside_boxes(
         ShapeError: If the points are not (p, 3).
         RangeError: If the margin is negative or not finite.
     """
-    check_shape("points", points, (None, 3))
     at = points.detach().cpu().double()
     inside = torch.zeros(len(at), dtype=torch.bool)
     for box in boxes:

@@ -16,7 +16,6 @@ from typing import Any
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from splatseg._check import check_shape
 from splatseg.core import upward
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.camera import Camera
@@ -235,9 +234,6 @@ class PointCloud:
 
     def __post_init__(self) -> None:
         convert_fields(self)
-        check_shape("points", self.points, (None, 3))
-        if self.colours is not None:
-            check_shape("colours", self.colours, (len(self.points), 3))
 
     def __len__(self) -> int:
         return len(self.points)

@@ -33,7 +33,6 @@ def cell_order(cells: Int[Tensor, "m 3"]) -> Int[Tensor, "m"]:
     Raises:
         RangeError: If a coordinate is beyond `MAX_CELL`.
     """
-    check_shape("cells", cells, (None, 3))
     cells = cells.long()
     if len(cells) and int(cells.abs().max()) >= MAX_CELL:
         raise RangeError(
@@ -70,8 +69,6 @@ class VoxelGrid:
 
     def __post_init__(self) -> None:
         convert_fields(self)
-        check_shape("cells", self.cells, (None, 3))
-        check_shape("origin", self.origin, (3,))
         check_finite("origin", self.origin)
         key = cell_order(self.cells)
         if bool((key[1:] <= key[:-1]).any()):
@@ -225,7 +222,6 @@ class VoxelFeatures(RowColumns):
             raise ShapeError(f"table: expected {count} rows, one a voxel, got {len(self.table)}.")
         check_shape("weights", self.weights, (count,))
         check_finite("weights", self.weights)
-        check_shape("rows", self.rows, (None, None))
         if self.rows.numel() and not -1 <= int(self.rows.min()) <= int(self.rows.max()) < count:
             raise RangeError(
                 f"rows: expected -1 or rows of {count} voxels, got "
@@ -237,7 +233,6 @@ class VoxelFeatures(RowColumns):
                 f"shares: expected those of {self.rows.shape[1]} voxels a Gaussian, got none."
             )
         if self.shares is not None:
-            check_shape("shares", self.shares, tuple(self.rows.shape))
             check_finite("shares", self.shares)
             if self.shares.numel() and float(self.shares.min()) < 0:
                 raise RangeError(f"shares: expected at least 0, got {float(self.shares.min())}.")

@@ -10,6 +10,7 @@ import torch
 
 from splatseg.core import Edited, Layer, Scene, Similarity, apply_rows
 from splatseg.core.boundary import boundary, convert_fields
+from splatseg.core.json_values import plain_object
 from splatseg.core.options import Natural
 from splatseg.errors import InputError, ShapeError
 from splatseg.io.atomic import is_vacant
@@ -123,9 +124,11 @@ class Operation:
             "kind": self.kind,
             "where": None if self.where is None else self.where.to_json(),
             "transform": moved,
-            "recolour": None if self.recolour is None else _lists(asdict(self.recolour)),
+            "recolour": None
+            if self.recolour is None
+            else plain_object("recolour", asdict(self.recolour)),
             "other": self.other,
-            "cut": None if self.cut is None else _lists(asdict(self.cut)),
+            "cut": self.cut and plain_object("cut", asdict(self.cut)),
             "specks": self.specks,
         }
         return {name: value for name, value in content.items() if value is not None}
@@ -212,16 +215,6 @@ class _Record:
     other: str | None = None
     cut: CutBy | None = None
     specks: int | None = None
-
-
-def _lists(values: Any) -> Any:
-    """Tuples as lists, all the way down: what JSON gives back."""
-    if isinstance(values, Mapping):
-        table = cast("Mapping[str, Any]", values)
-        return {key: _lists(value) for key, value in table.items()}
-    if isinstance(values, (tuple, list)):
-        return [_lists(value) for value in cast("Sequence[Any]", values)]
-    return values
 
 
 # A scene with its layers, which edits change together.

@@ -373,7 +373,6 @@ def id_pair(predicted: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _image_pair(image: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
-    check_shape("image", image, (None, None, None))
     if image.shape != truth.shape:
         raise ShapeError(
             f"image: expected the photograph's size {tuple(truth.shape)}, got {tuple(image.shape)}."

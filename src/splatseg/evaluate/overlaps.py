@@ -18,7 +18,6 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splatseg._check import check_shape
 from splatseg.core import UNLABELLED
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError, ShapeError
@@ -47,8 +46,6 @@ class Overlaps:
 
     def __post_init__(self) -> None:
         convert_fields(self)
-        check_shape("pairs", self.pairs, (None, 2))
-        check_shape("counts", self.counts, (len(self.pairs),))
 
     @classmethod
     def of(cls, predicted: Int[Tensor, "*shape"], truth: Int[Tensor, "*shape"]) -> "Overlaps":

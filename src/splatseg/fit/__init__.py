@@ -6,7 +6,6 @@ photographs and from any other differentiable loss.
 
 from splatseg.core.checkpoints import Checkpoints as Checkpoints
 from splatseg.fit._checkpoint import CheckpointSummary as CheckpointSummary
-from splatseg.fit._checkpoint import CheckpointVersionError as CheckpointVersionError
 from splatseg.fit._checkpoint import checkpoint_gaussians as checkpoint_gaussians
 from splatseg.fit._checkpoint import checkpoint_summary as checkpoint_summary
 from splatseg.fit._options import FitOptions as FitOptions
@@ -31,3 +30,4 @@ from splatseg.fit.depth import SCAN_SPACING as SCAN_SPACING
 from splatseg.fit.depth import DepthPoints as DepthPoints
 from splatseg.fit.depth import aligned_inverse as aligned_inverse
 from splatseg.fit.depth import scan_depths as scan_depths
+from splatseg.io.checkpoint_files import CheckpointVersionError as CheckpointVersionError

@@ -8,14 +8,12 @@ next one overwrites. Each array has a checksum, so damage is detected.
 
 import hashlib
 import json
-import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from splatseg.core import Capture, Gaussians, View
@@ -26,25 +24,18 @@ from splatseg.core.checkpoints import (
     CheckpointSchedule,
     differing_names,
     option_differences,
-    without_checkpoint,
 )
 from splatseg.core.options import removed_options
-from splatseg.errors import FileFormatError, InputError, OutputError, brief, quoted
+from splatseg.errors import FileFormatError, InputError, brief
 from splatseg.fit._options import FitOptions
 from splatseg.fit._parameters import Parameters, final_gaussians
-from splatseg.io.arrays import Npz, open_npz, write_checkpoint_file
+from splatseg.io.arrays import write_checkpoint_file
+from splatseg.io.checkpoint_files import read_checkpoint_file
 from splatseg.io.digests import camera_numbers, digest, file_mark
 from splatseg.io.json_files import parse_object
 
-FORMAT = "splatseg-fit"
 VERSION = 1
 """Version of the files written. No other version is read."""
-
-_HEADER = "header"
-
-
-class CheckpointVersionError(FileFormatError):
-    """A checkpoint is valid, but of a version that cannot be resumed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -114,7 +105,7 @@ def write_checkpoint(state: FitState, path: Path) -> None:
         OutputError: If it cannot be written; the previous one is kept.
     """
     header = {
-        "format": FORMAT,
+        "format": "splatseg-fit",
         "version": VERSION,
         "identity": dict(state.identity),
         "content": dict(state.content),
@@ -128,17 +119,20 @@ def read_checkpoint(path: Path) -> FitState:
 
     Raises:
         MissingFileError: If there is no such file.
-        CheckpointVersionError: If it is of another version.
         FileFormatError: If it is not a checkpoint, or damaged.
     """
-    with open_npz(path, expected="the checkpoint of a fit") as archive:
-        header = _header(path, archive)
-        names = [name for name in archive.names if name != _HEADER]
-        tensors = {name: torch.from_numpy(_array(path, archive, name)) for name in names}
+    return _read(path)
+
+
+def _read(path: Path, names: Collection[str] | None = None) -> FitState:
+    header, arrays = read_checkpoint_file(path, "fit", VERSION, names)
+    content, identity = header.get("content"), header.get("identity")
+    if not isinstance(content, dict) or not isinstance(identity, dict):
+        raise FileFormatError(f"{path}: expected a header with content and identity.")
     return FitState(
-        tensors=tensors,
-        content=header["content"],
-        identity=header["identity"],
+        tensors={name: torch.from_numpy(array) for name, array in arrays.items()},
+        content=cast("dict[str, Any]", content),
+        identity=cast("dict[str, Any]", identity),
         where=str(path),
     )
 
@@ -163,12 +157,9 @@ def checkpoint_summary(path: Path) -> CheckpointSummary:
 
     Raises:
         MissingFileError: If there is no such file.
-        CheckpointVersionError: If it is of another version.
         FileFormatError: If it is not a checkpoint, or damaged.
     """
-    with open_npz(path, expected="the checkpoint of a fit") as archive:
-        content = _header(path, archive)["content"]
-    state = FitState(tensors={}, content=content, where=str(path))
+    state = _read(path, names=())
     return CheckpointSummary(
         steps=int(state.number("steps")),
         progress=state.number("progress"),
@@ -183,36 +174,10 @@ def checkpoint_gaussians(path: Path) -> Gaussians:
 
     Raises:
         MissingFileError: If there is no such file.
-        CheckpointVersionError: If it is of another version.
         FileFormatError: If it is not a checkpoint, or damaged.
     """
     state = read_checkpoint(path)
     return final_gaussians(parameters_of(state, "parameters", torch.device("cpu")))
-
-
-def _array(path: Path, archive: Npz, name: str) -> NDArray[Any]:
-    array = archive.array(name)
-    if array.dtype.kind not in "fiub":
-        raise FileFormatError(f"{path}: expected {quoted(name)} to be an array of numbers.")
-    return array
-
-
-def _header(path: Path, archive: Npz) -> dict[str, Any]:
-    if _HEADER not in archive:
-        raise FileFormatError(f"{path}: expected the checkpoint of a fit, got another archive.")
-    header = parse_object(_array(path, archive, _HEADER).tobytes(), where=str(path))
-    if header.get("format") != FORMAT:
-        raise FileFormatError(
-            f"{path}: expected the checkpoint of a fit, got {quoted(header.get('format'))}."
-        )
-    if header.get("version") != VERSION:
-        raise CheckpointVersionError(
-            f"{path}: this fit cannot be resumed, as another splatseg stopped it (expected a "
-            f"checkpoint of version {VERSION}, got version {quoted(header.get('version'))})."
-        )
-    if not isinstance(header.get("content"), dict) or not isinstance(header.get("identity"), dict):
-        raise FileFormatError(f"{path}: expected a header with content and identity.")
-    return header
 
 
 # Identity of a fit: its data, options and renderer. A checkpoint resumes only the same fit.
@@ -360,14 +325,8 @@ class CheckpointClock:
 
     def write(self, state: FitState) -> float:
         """Write a checkpoint, or tell that it cannot be. Returns the seconds it took."""
-        begin = time.monotonic()
-        try:
-            write_checkpoint(replace(state, identity=self._identity), self._checkpoints.path)
-        except OutputError as error:
-            self._checkpoints.failed(without_checkpoint(error))
-        seconds = time.monotonic() - begin
-        self._schedule.written(seconds)
-        return seconds
+        whole = replace(state, identity=self._identity)
+        return self._schedule.write(lambda: write_checkpoint(whole, self._checkpoints.path))
 
 
 # State of a fit between two steps: tensors by name, and numbers in JSON.

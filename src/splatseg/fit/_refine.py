@@ -15,7 +15,6 @@ from torch import Tensor
 from splatseg._check import check_range
 from splatseg.core import Camera, Gaussians, View
 from splatseg.core.boundary import boundary
-from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError
 from splatseg.fit._options import FitOptions
 from splatseg.fit._parameters import Parameters, UpdateSettings, final_gaussians, rates_at
@@ -82,16 +81,13 @@ class Refinement:
         self._model = gaussians
         self._generator = torch.Generator().manual_seed(options.seed)
         needs_points = options.refine_poses or options.depth == "relative"
-        with one_torch_thread():
-            self._views = ViewModules.of(
-                views,
-                points=_points_of(gaussians, views, backend=renderer.name)
-                if needs_points
-                else None,
-                options=options,
-                where="refine",
-                exposures=exposures,
-            )
+        self._views = ViewModules.of(
+            views,
+            points=_points_of(gaussians, views, backend=renderer.name) if needs_points else None,
+            options=options,
+            where="refine",
+            exposures=exposures,
+        )
         self._training = TrainingStep(
             name="refine",
             options=options,
@@ -122,10 +118,10 @@ class Refinement:
         """Current exposures by name of the view; empty without `FitOptions.exposure`."""
         return self._views.learned_exposures()
 
+    @boundary
     def gaussians(self) -> Gaussians:
         """The current Gaussians, on the CPU, in the rows of the initial ones."""
-        with one_torch_thread():
-            now = self._views.in_capture_frame(final_gaussians(self._state[0]))
+        now = self._views.in_capture_frame(final_gaussians(self._state[0]))
         return self._model.replace(
             means=now.means,
             rotations=now.rotations,
@@ -134,16 +130,13 @@ class Refinement:
             sh=now.sh,
         )
 
+    @boundary
     def step(self, extra_loss: ExtraLoss | None = None) -> None:
         """One step on the photograph of the next view, and on a further loss.
 
         Raises:
             SplatsegError: If the loss is no longer a number.
         """
-        with one_torch_thread():
-            self._step(extra_loss)
-
-    def _step(self, extra_loss: ExtraLoss | None) -> None:
         progress = self._start + (1 - self._start) * self._steps_done / max(1, self._steps)
         progress = min(1.0, progress)
         example = self._training.next_example()

@@ -11,7 +11,6 @@ import torch
 from splatseg.core import Camera, Capture, Gaussians, View
 from splatseg.core.boundary import boundary
 from splatseg.core.checkpoints import Checkpoints, Interrupts, deferred_interrupts
-from splatseg.core.threads import one_torch_thread
 from splatseg.errors import FileFormatError, InputError
 from splatseg.fit._checkpoint import (
     CheckpointClock,
@@ -167,23 +166,21 @@ def fit(
         clock = CheckpointClock(checkpoints, identity=identity)
     photographs = TrainingPhotographs.of(views, options=options)
     saved = None if clock is None else clock.saved()
-    with one_torch_thread():
-        run = FitRun(capture, options, renderer, photographs, saved=saved)
-    with deferred_interrupts() as interrupts, one_torch_thread():
+    run = FitRun(capture, options, renderer, photographs, saved=saved)
+    with deferred_interrupts() as interrupts:
         interrupted = _run_steps(run, interrupts, clock=clock, progress=progress)
         at_end = checkpoints is not None and checkpoints.at_end
         if (interrupted or at_end) and run.between_steps and not interrupts.forced:
             _write_checkpoint(run, clock)
-    with one_torch_thread():
-        gaussians, refined = run.gaussians(), run.views.refined(capture.views)
-        notes = run.views.notes()
-        if options.prune_floaters and not interrupted:
-            pruned = without_floaters(gaussians, photographs, refined, backend=renderer.name)
-            note = (
-                f"{len(gaussians) - len(pruned)} of {len(gaussians)} Gaussians are left out, which "
-                "no photograph needs."
-            )
-            gaussians, notes = pruned, (*notes, note)
+    gaussians, refined = run.gaussians(), run.views.refined(capture.views)
+    notes = run.views.notes()
+    if options.prune_floaters and not interrupted:
+        pruned = without_floaters(gaussians, photographs, refined, backend=renderer.name)
+        note = (
+            f"{len(gaussians) - len(pruned)} of {len(gaussians)} Gaussians are left out, which "
+            "no photograph needs."
+        )
+        gaussians, notes = pruned, (*notes, note)
     return FitResult(
         gaussians=gaussians,
         steps=run.steps,

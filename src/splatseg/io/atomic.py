@@ -9,6 +9,7 @@ another one is writing, and `sweep` removes it. What data names is written below
 
 import contextlib
 import errno
+import fcntl
 import os
 import shutil
 import tempfile
@@ -130,13 +131,8 @@ def check_utf8(path: Path) -> None:
         ) from error
 
 
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None
-
 Lock = Literal["taken", "held", "unknown"]
-"""We have it now; another one has it; the file system or the system has no such locks."""
+"""We have it now; another one has it; the file system has no such locks."""
 
 
 def try_lock(handle: int, *, shared: bool = False) -> Lock:
@@ -146,8 +142,6 @@ def try_lock(handle: int, *, shared: bool = False) -> Lock:
         handle: Its descriptor.
         shared: Others may have it at the same time, if theirs is shared too.
     """
-    if fcntl is None:
-        return "unknown"
     try:
         fcntl.flock(handle, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
     except BlockingIOError:

@@ -19,7 +19,7 @@ from splatseg.core.scene import view_name_fault
 from splatseg.errors import FileFormatError
 from splatseg.io.captures.nerfstudio import LENS_KEYS, Frame, frame_matrix, frames_of, lens_of
 from splatseg.io.captures.raw_views import checked_pose, opencv_from_opengl
-from splatseg.io.foreign import made_from, malformed
+from splatseg.io.foreign import derived_from, malformed
 
 _MODEL_NAMES = {
     "pinhole": "PINHOLE",
@@ -134,7 +134,7 @@ def _view(frame: StoredFrame, *, folder: Path, source: Path | None, where: str) 
     if fault is not None:
         raise FileFormatError(f"{where}: {fault}.")
     image, mask, depth = (_resolve(frame, key, folder, source) for key in _FILES.values())
-    with made_from(where):
+    with derived_from(where):
         return View(
             name=frame.name,
             split=frame.split,
@@ -158,7 +158,7 @@ def _camera(frame: StoredFrame, *, where: str) -> Camera:
     pinhole = frame.camera_model == _MODEL_NAMES["pinhole"]
     pose = checked_pose(opencv_from_opengl(frame_matrix(frame, where=where)), where=where)
     w, h, fx, fy, cx, cy = (_needed(frame, key, where) for key in _SIZES)
-    with made_from(where):
+    with derived_from(where):
         return Camera(
             width=int(w),
             height=int(h),

@@ -140,7 +140,7 @@ def is_folder(path: Path) -> bool:
 
 
 @contextmanager
-def made_from(where: object) -> Generator[None]:
+def derived_from(where: object) -> Generator[None]:
     """Name the file in errors of values that are made from it, which know of no file.
 
     Raises:

@@ -240,7 +240,7 @@ def image_camera(view: View, longest: int | None = None) -> Camera:
 
 @boundary
 def save_png(
-    image: Int[Tensor, "height width"]
+    image: Int[Tensor, "height width *channels"]
     | UInt8[Tensor, "height width *channels"]
     | Float[Tensor, "height width *channels"],
     path: Path,

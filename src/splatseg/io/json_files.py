@@ -12,8 +12,6 @@ from splatseg.io.atomic import atomic_file
 from splatseg.io.foreign import expect, malformed, read_bytes
 
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]|[\ud800-\udfff]")
-_LONE = re.compile("[\ud800-\udfff]")
-"""Pairs have become one character when JSON is parsed; what is left has no partner."""
 
 
 def parse_object(text: str | bytes, *, where: str) -> dict[str, Any]:
@@ -38,7 +36,10 @@ def _parsed(text: str | bytes, *, where: str) -> object:
     except (ValueError, RecursionError) as error:
         raise malformed(where, f"JSON, but it cannot be parsed ({reason(error)})") from error
     if _SURROGATE.search(decoded) is not None:
-        _refuse_surrogates(value, where)
+        try:
+            json.dumps(value, ensure_ascii=False).encode()
+        except (UnicodeEncodeError, RecursionError) as error:
+            raise malformed(where, f"Unicode text ({reason(error)})") from error
     return value
 
 
@@ -60,19 +61,6 @@ def read_json_value(path: Path) -> Any:
         FileFormatError: If it is not JSON.
     """
     return _parsed(read_bytes(path, "a JSON file"), where=str(path))
-
-
-def _refuse_surrogates(content: object, where: str) -> None:
-    """Refuse text that no file name, terminal or other file could hold."""
-    pending: list[object] = [content]
-    while pending:
-        value = pending.pop()
-        if isinstance(value, dict):
-            pending += [*value.keys(), *value.values()]  # pyright: ignore[reportUnknownArgumentType]
-        elif isinstance(value, list):
-            pending += value  # pyright: ignore[reportUnknownArgumentType]
-        elif isinstance(value, str) and _LONE.search(value) is not None:
-            raise FileFormatError(f"{where}: expected Unicode text, got {quoted(value)}.")
 
 
 def json_text(name: str, value: Mapping[str, Any], *, indent: int | None = None) -> str:

@@ -37,7 +37,7 @@ from splatseg.core.json_values import MAX_NUMBER
 from splatseg.errors import FileFormatError, InputError, reason
 from splatseg.io.arrays import HEADER, open_npz, save_arrays
 from splatseg.io.atomic import atomic_file
-from splatseg.io.foreign import expect, made_from, malformed
+from splatseg.io.foreign import derived_from, expect, malformed
 from splatseg.io.json_files import check_version, parse_object
 from splatseg.io.schema import structured
 
@@ -206,7 +206,7 @@ def load_layer(path: Path) -> Layer:
         raise FileFormatError(f"{path}: expected an object {key!r} in the header, got none.")
     read = layer_info_from_json if key == "info" else layer_info_from_metadata
     info = read(record, where=f"{path}: {key}")
-    with made_from(path):
+    with derived_from(path):
         return _File(path, header, arrays, info).layer()
 
 

@@ -10,10 +10,10 @@ property list uchar int vertex_indices
 end_header
 """
 
-import itertools
 from collections.abc import Collection, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +21,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatseg.errors import FileFormatError, quoted, reason
-from splatseg.io.foreign import expect, read_bytes, reading
+from splatseg.io.foreign import expect, reading
 from splatseg.io.text_numbers import number_table
 
 MAX_HEADER = 1 << 20
 """Bytes in which the header must end; real ones have two or three thousand."""
+
+_TEXT_ROWS = 1 << 14
+"""Rows of an ASCII file that are parsed together."""
 
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
@@ -110,7 +113,8 @@ class PlyTable:
 
     count: int
     numbers: Mapping[str, NDArray[Any]]
-    """Columns of numbers by name; integers keep their type, those of text are int64 or float64."""
+    """Columns of numbers by name, of binary files views of the file; real ones of text may be
+    float64, others have the type that the header says."""
 
     lists: Mapping[str, PlyLists] = field(default_factory=dict[str, PlyLists])
 
@@ -210,23 +214,32 @@ def ply_columns(path: Path) -> tuple[str, ...]:
     return tuple(one.name for element in elements for one in element.properties)
 
 
-def read_ply_tables(path: Path, header: PlyHeader, names: Collection[str]) -> dict[str, PlyTable]:
+def read_ply_tables(
+    path: Path, header: PlyHeader, names: Collection[str], *, whole: bool = False
+) -> dict[str, PlyTable]:
     """The tables of these elements, those that the file has.
 
-    Nothing behind the last of them is read.
+    Args:
+        path: The file.
+        header: What `read_ply_header` gives.
+        names: The elements.
+        whole: Go through what is behind them too, up to an element that has lists: the file must
+            be as long as its header says. Numbers of text have the types of the header then.
 
     Raises:
         FileFormatError: If the file ends early, or a row is not what the header says.
     """
     found: dict[str, PlyTable] = {}
     wanted = [element.name for element in header.elements if element.name in names]
-    reader = _BinaryRows(path, header) if header.order else _TextRows(path, header)
+    reader = _BinaryRows(path, header) if header.order else _TextRows(path, header, declared=whole)
     for element in header.elements:
-        if len(found) == len(wanted):
-            break
-        table = reader.next(element)
+        if len(found) == len(wanted) and (element.lists or not whole):
+            return found
+        table = reader.next(element) if element.properties else PlyTable(count=0, numbers={})
         if element.name in names:
             found[element.name] = table
+    left = reader.left()
+    expect(not left, path, f"the end of the file after its elements, got {left} more")
     return found
 
 
@@ -239,10 +252,10 @@ def read_ply_vertices(path: Path) -> Mapping[str, NDArray[Any]]:
             ends early.
     """
     header = read_ply_header(path)
-    first = header.elements[0] if header.elements else PlyElement(name="", count=0)
-    expect(first.name == "vertex", path, "a PLY whose first element is vertex")
-    names = quoted(", ".join(first.names))
-    expect({"x", "y", "z"} <= set(first.names), path, f"vertices with x, y and z, got {names}")
+    vertex = [one.names for one in header.elements[:1] if one.name == "vertex"]
+    names = vertex[0] if vertex else ()
+    what = "a PLY whose first element is vertex with x, y and z"
+    expect({"x", "y", "z"} <= set(names), path, what, ", ".join(names) or None)
     return read_ply_tables(path, header, ["vertex"])["vertex"].numbers
 
 
@@ -257,85 +270,6 @@ def vertex_positions(path: Path, columns: Mapping[str, NDArray[Any]]) -> NDArray
         bad = int((~np.isfinite(points)).any(axis=1).sum())
         raise FileFormatError(f"{path}: {bad} of {len(points)} points are not finite.")
     return points
-
-
-def ply_offsets(path: Path, header: PlyHeader) -> dict[str, int]:
-    """Where rows of elements start, of a file that is exactly as long as its header says.
-
-    They are bytes of the file, in ASCII lines after the header. Elements that have lists and
-    follow ``vertex`` end the table, as only their rows would tell their lengths.
-
-    Raises:
-        FileFormatError: If the file is longer or shorter.
-    """
-    with reading(path, _KIND):
-        size = path.stat().st_size
-    offsets: dict[str, int] = {}
-    if not header.order:
-        at = least = 0
-        for element in header.elements:
-            offsets[element.name] = at
-            at += element.count if element.properties else 0
-            # A value takes a digit and what parts it from the next, a list its length.
-            least += 2 * element.count * len(element.properties)
-        have = size - header.offset
-        what = f"lines of values of at least {least - 1} bytes, got {have}: the file is truncated"
-        expect(have >= least - 1, path, what)
-        return offsets
-    reader = _BinaryRows(path, header)
-    for element in header.elements:
-        offsets[element.name] = reader.at
-        if not element.lists:
-            reader.at += element.count * element.dtype().itemsize
-        elif "vertex" in offsets:
-            return offsets
-        else:
-            reader.next(element)
-    fault = "truncated" if size < reader.at else "longer than its counts"
-    what = f"{reader.at} bytes as its header promises, got {size}: the file is {fault}"
-    expect(size == reader.at, path, what)
-    return offsets
-
-
-def read_ply_rows(
-    path: Path, header: PlyHeader, name: str, offsets: Mapping[str, int], *, block: int
-) -> Iterator[tuple[slice, NDArray[Any]]]:
-    """Rows of an element without lists, `block` at once, as arrays of records.
-
-    Raises:
-        FileFormatError: If lines of an ASCII file are fewer or more than its header says, or one
-            is not the numbers of a row.
-    """
-    element = header.element(name) or PlyElement(name=name, count=0)
-    dtype = element.dtype(header.order)
-    with path.open("rb") as file:
-        parts = (
-            slice(start, min(start + block, element.count))
-            for start in range(0, element.count, block)
-        )
-        if header.order:
-            file.seek(offsets[name])
-            for part in parts:
-                yield part, np.fromfile(file, dtype, part.stop - part.start)
-            return
-        file.seek(header.offset)
-        total = sum(one.count for one in header.elements if one.properties)
-        lines = (line for line in file if not line.isspace())
-        at = sum(1 for _ in itertools.islice(lines, offsets[name]))
-        for part in parts:
-            wanted = part.stop - part.start
-            with _parsing(path, f"lines of {len(element.properties)} numbers", element):
-                table = number_table(list(itertools.islice(lines, wanted)), len(element.properties))
-            at += len(table)
-            what = f"{total} lines of values, the file ends at {at}: it is truncated"
-            expect(len(table) == wanted, path, what)
-            rows = np.empty(wanted, dtype)
-            with np.errstate(over="ignore"), _parsing(path, "numbers", element):
-                for one, values in zip(element.properties, table.T, strict=True):
-                    rows[one.name] = _typed(values, one)
-            yield part, rows
-        at += sum(1 for _ in lines)
-        expect(at == total, path, f"{total} lines of values, got {at}")
 
 
 @contextmanager
@@ -357,7 +291,12 @@ class _BinaryRows:
         self._order = header.order
         self.at = header.offset
         with reading(path, _KIND):
-            self._data = np.memmap(path, np.uint8, "r")
+            self._data = np.asarray(np.memmap(path, np.uint8, "r"))
+
+    def left(self) -> str:
+        """What was not gone through."""
+        more = len(self._data) - self.at
+        return f"{more} bytes" if more else ""
 
     def next(self, element: PlyElement) -> PlyTable:
         """The table of the next element."""
@@ -382,7 +321,7 @@ class _BinaryRows:
                 starts = np.arange(element.count + 1, dtype=np.int64)
                 return PlyTable(
                     count=element.count,
-                    numbers={name: rows[name].copy() for name in element.names},
+                    numbers={name: rows[name] for name in element.names},
                     lists={
                         name: PlyLists(starts=starts * length, values=rows[name].flatten())
                         for name, length in lengths.items()
@@ -415,32 +354,59 @@ class _BinaryRows:
 
 
 class _TextRows:
-    """Goes through the elements of an ASCII file, one row a line."""
+    """Goes through the elements of an ASCII file, one row a line, some thousands at once."""
 
-    def __init__(self, path: Path, header: PlyHeader) -> None:
-        self._path = path
-        lines = read_bytes(path, _KIND)[header.offset :].split(b"\n")
-        self._lines = [line for line in lines if line and not line.isspace()]
-        self._at = 0
+    def __init__(self, path: Path, header: PlyHeader, *, declared: bool) -> None:
+        self._path, self._declared = path, declared
+        with reading(path, _KIND):
+            self._bytes = path.stat().st_size - header.offset
+        self._lines = _text_lines(path, header.offset)
+
+    def left(self) -> str:
+        """What was not gone through."""
+        more = sum(1 for _ in self._lines)
+        return f"{more} lines" if more else ""
 
     def next(self, element: PlyElement) -> PlyTable:
         """The table of the next element."""
-        lines = self._lines[self._at : self._at + element.count]
-        self._at += element.count
-        what = f"{element.count} rows of {quoted(element.name)}, got {len(lines)}"
-        expect(len(lines) == element.count, self._path, what)
-        with _parsing(
-            self._path, f"{element.count} rows of {len(element.properties)} numbers", element
-        ):
-            return _parsed(element, lines)
+        count, columns = element.count, len(element.properties)
+        # A value takes a digit and what parts it from the next: memory is taken for what can be.
+        have = self._bytes
+        fits = have >= 2 * count * columns - 1
+        expect(fits, self._path, f"{count} rows of {quoted(element.name)}, got {have} bytes")
+        with _parsing(self._path, f"{count} rows of {columns} numbers", element):
+            if element.lists:
+                return _with_lists(element, self._rows(element, 0, count))
+            types = [np.float64 if one.code[0] == "f" else one.code for one in element.properties]
+            numbers = {
+                name: np.empty(count, kind) for name, kind in zip(element.names, types, strict=True)
+            }
+            for start in range(0, count, _TEXT_ROWS):
+                stop = min(start + _TEXT_ROWS, count)
+                table = number_table(self._rows(element, start, stop), columns)
+                with np.errstate(over="ignore"):  # beyond float32: infinite, which readers refuse
+                    for one, values in zip(element.properties, table.T, strict=True):
+                        numbers[one.name][start:stop] = _typed(values, one)
+            return PlyTable(count=count, numbers=numbers)
+
+    def _widens(self, column: PlyProperty) -> bool:
+        """Whether it keeps what text has beyond its type, as for coordinates of a whole earth."""
+        return column.code[0] == "f" and not self._declared
+
+    def _rows(self, element: PlyElement, start: int, stop: int) -> list[bytes]:
+        lines = list(islice(self._lines, stop - start))
+        what = f"{element.count} rows of {quoted(element.name)}, got {start + len(lines)}"
+        expect(len(lines) == stop - start, self._path, what)
+        return lines
 
 
-def _parsed(element: PlyElement, lines: list[bytes]) -> PlyTable:
-    if not element.lists:
-        table = number_table(lines, len(element.properties))
-        columns = zip(element.properties, table.T, strict=True)
-        numbers = {one.name: _typed(values, one).copy() for one, values in columns}
-        return PlyTable(count=element.count, numbers=numbers)
+def _text_lines(path: Path, offset: int) -> Iterator[bytes]:
+    with path.open("rb") as file:
+        file.seek(offset)
+        yield from (line for line in file if not line.isspace())
+
+
+def _with_lists(element: PlyElement, lines: Sequence[bytes]) -> PlyTable:
     rows = _Columns(element)
     for line in lines:
         words = [float(word) for word in line.split()]

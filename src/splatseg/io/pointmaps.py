@@ -24,9 +24,9 @@ from splatseg.core.models import Pointmap
 from splatseg.errors import InputError, MissingFileError, quoted
 from splatseg.io.arrays import read_npz, save_arrays
 from splatseg.io.atomic import atomic_file, named_write_failures
-from splatseg.io.foreign import expect, made_from
-from splatseg.io.json_files import write_json
-from splatseg.io.schema import check_array, read_structured
+from splatseg.io.foreign import derived_from, expect
+from splatseg.io.json_files import check_version, read_json, write_json
+from splatseg.io.schema import check_array, structured
 
 FORMAT = "splatseg-pointmaps"
 VERSION = 1
@@ -41,8 +41,6 @@ _HALF_MAX = 60_000.0
 
 @dataclass(frozen=True, slots=True)
 class _Header:
-    format: Any
-    version: Any
     photographs: list[str]
     metadata: dict[str, Any] = field(default_factory=dict[str, Any])
 
@@ -156,10 +154,9 @@ def open_pointmaps(folder: Path) -> RecordedPointmaps:
     path = folder / HEADER_FILE
     if not path.is_file():
         raise MissingFileError(f"{folder}: expected a folder of pointmaps, with {HEADER_FILE}.")
-    header = read_structured(path, _Header)
-    known = header.format == FORMAT and header.version == VERSION
-    what = f"format {FORMAT!r} of version {VERSION}"
-    expect(known, path, f"{what}, got {quoted(header.format)} of version {quoted(header.version)}")
+    content = read_json(path)
+    check_version(path, content, format=FORMAT, version=VERSION, what="pointmaps")
+    header = structured(content, _Header, where=path)
     names = tuple(header.photographs)
     expect(len(set(names)) == len(names), path, "distinct photographs, got one twice")
     return RecordedPointmaps(folder=folder, photographs=names, metadata=header.metadata)
@@ -180,7 +177,7 @@ def _pointmap(path: Path, points: NDArray[Any], confidence: NDArray[Any], which:
     sides = all(1 <= side <= _MAX_SIDE for side in shape[:2])
     expect(sides, path, f"points_{which} of 1 to {_MAX_SIDE} a side, got {shape}")
     check_array(path, f"confidence_{which}", confidence, shape[:2], "f")
-    with made_from(path):
+    with derived_from(path):
         return Pointmap(
             points=torch.from_numpy(points.astype(np.float32)),
             confidence=torch.from_numpy(confidence.astype(np.float32)),

@@ -42,7 +42,7 @@ from splatseg.io.atomic import (
     sync_tree,
 )
 from splatseg.io.cameras import cameras_content, relative_path, source_paths, views_from_content
-from splatseg.io.foreign import expect, is_file, is_folder, made_from
+from splatseg.io.foreign import derived_from, expect, is_file, is_folder
 from splatseg.io.json_files import check_version, read_json, write_json
 from splatseg.io.layers import load_layer, save_layer
 from splatseg.io.scene_folder import (
@@ -171,7 +171,7 @@ def load_scene(root: Path | str, *, data: Path | str | None = None) -> Scene:
     what = f"a split that names each view of {CAMERAS_FILE} once"
     expect(once and set(of_view) == {view.name for view in views}, where, what)
     classes = None if content.classes is None else class_table(content.classes, where=str(where))
-    with made_from(where):
+    with derived_from(where):
         return Scene(
             gaussians=gaussians,
             # The splits of scene.json come before those of the cameras file.

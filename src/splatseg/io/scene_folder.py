@@ -29,6 +29,7 @@ from splatseg.io.atomic import (
     try_lock,
 )
 from splatseg.io.json_files import parse_object
+from splatseg.io.schema import structured
 
 LOCK_FILE = f"{TEMPORARY}lock"
 
@@ -55,8 +56,8 @@ class LockOwner:
     def __str__(self) -> str:
         """In words."""
         began = time.strftime("%H:%M", time.localtime(self.since))
-        machine = "" if self.host == socket.gethostname() else f" on {self.host}"
-        return f"{self.work}, process {self.process}{machine}, since {began}"
+        machine = "" if self.host == socket.gethostname() else f" on {self.host:.80}"
+        return f"{self.work:.40}, process {self.process}{machine}, since {began}"
 
 
 _held: dict[Path, int] = {}
@@ -175,13 +176,8 @@ def _read(handle: int) -> LockOwner | None:
     """What a lock file says; None where it says nothing yet."""
     try:
         entry = parse_object(os.pread(handle, 4096, 0), where=LOCK_FILE)
-        return LockOwner(
-            work=str(entry["work"])[:40],
-            process=int(entry["process"]),
-            host=str(entry["host"])[:80],
-            since=float(entry["since"]),
-        )
-    except (FileFormatError, OSError, ValueError, KeyError, TypeError, OverflowError):
+        return structured(entry, LockOwner, where=LOCK_FILE)
+    except (FileFormatError, OSError):
         return None
 
 

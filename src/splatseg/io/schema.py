@@ -17,8 +17,9 @@ import functools
 import re
 import types
 import typing
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields, is_dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import is_dataclass
+from itertools import count, repeat
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, Union, cast
 
@@ -41,10 +42,6 @@ Whole = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 
 Name = Annotated[str, Meta(min_length=1)]
 
-_Bad = tuple[str, float] | None
-"""Where in a value a number is that is none, and the number."""
-
-_Check = Callable[[Any], _Bad]
 _MAX_WHOLE = 2**53
 _PLACE = re.compile(r"^(?P<what>.*?)(?: - at `(?:key in )?\$(?P<at>.*)`)?$", re.DOTALL)
 _STEP = re.compile(r"\.([^.\[]+)|\[(\d+|\.\.\.)\]")
@@ -134,9 +131,7 @@ def structured(value: object, kind: type[T], *, where: object, strict: bool = Tr
         raise FileFormatError(_sentence(value, kind, str(error), where)) from error
     except RecursionError as error:
         raise malformed(where, "values within each other, got too many") from error
-    check = _finite(kind)
-    bad = None if check is None else check(found)
-    if bad is not None:
+    if (bad := _strange(kind, found)) is not None:
         raise malformed(_place(where, bad[0]), f"a finite number up to {MAX_NUMBER:g}", bad[1])
     return found
 
@@ -162,69 +157,54 @@ def _with_whole_numbers(value: Any) -> Any:
 
 
 @functools.cache
-def _finite(kind: Any) -> _Check | None:
-    """What refuses numbers of a type that are NaN, infinite or too large; None without numbers."""
+def _numbers_in(kind: Any, within: tuple[Any, ...] = ()) -> Any:
+    """Where a type has numbers that must be finite; None where it has none.
+
+    `float`, the types of fields by name, (class, type) of members of a union, or the type of items.
+    A class that is among those it is within, as a field of itself, counts as having some.
+    """
     origin, args = typing.get_origin(kind), typing.get_args(kind)
     if kind is float:
-        return _check_number
+        return float
     if origin is Annotated:
         free = any(m.extra and m.extra.get("infinite") for m in args[1:] if hasattr(m, "extra"))
-        return None if free else _finite(args[0])
-    if origin in (Union, types.UnionType):
-        kinds = [_plain_type(m) for m in args]
-        members = [
-            (typing.get_origin(k) or k, _finite(m)) for k, m in zip(kinds, args, strict=True)
-        ]
-        known = [(cls, check) for cls, check in members if check is not None]
-        return functools.partial(_check_union, known) if known else None
-    if origin in (list, tuple, dict):
-        inner = next((check for arg in args if (check := _finite(arg)) is not None), None)
-        if inner is None:
-            return None
-        return _check_numbers if inner is _check_number else functools.partial(_check_items, inner)
-    declared = isinstance(kind, type) and is_dataclass(kind)
-    return functools.partial(_check_fields, kind) if declared else None
+        return None if free else _numbers_in(args[0], within)
+    if isinstance(kind, type) and is_dataclass(kind):
+        if kind in within:
+            return kind
+        hints = typing.get_type_hints(kind, include_extras=True)
+        within = (*within, kind)
+        return {name: hint for name, hint in hints.items() if _numbers_in(hint, within)} or None
+    inner = [arg for arg in args if _numbers_in(arg, within)]
+    if origin not in (Union, types.UnionType):
+        return tuple(inner[:1]) or None
+    plain = ((typing.get_args(m)[0] if typing.get_origin(m) is Annotated else m) for m in inner)
+    return [(typing.get_origin(p) or p, one) for p, one in zip(plain, inner, strict=True)] or None
 
 
-@functools.cache
-def _number_fields(kind: type[Any]) -> list[tuple[str, _Check]]:
-    hints = typing.get_type_hints(kind, include_extras=True)
-    return [(f.name, check) for f in fields(kind) if (check := _finite(hints[f.name]))]
-
-
-def _plain_type(kind: Any) -> Any:
-    return typing.get_args(kind)[0] if typing.get_origin(kind) is Annotated else kind
-
-
-def _check_number(value: float) -> _Bad:
-    return None if abs(value) <= MAX_NUMBER else ("", value)
-
-
-def _check_numbers(values: Any) -> _Bad:
-    listed = values.values() if isinstance(values, dict) else values
-    if all(abs(value) <= MAX_NUMBER for value in listed):
+def _strange(kind: Any, value: Any) -> tuple[str, float] | None:
+    """Where in a value of a type a number is that is NaN, infinite or too large, and the number."""
+    numbers = _numbers_in(kind)
+    if numbers is float:
+        return None if abs(value) <= MAX_NUMBER else ("", value)
+    if isinstance(numbers, list):
+        for cls, one in numbers:
+            if isinstance(value, cls) and (bad := _strange(one, value)) is not None:
+                return bad
         return None
-    return _check_items(_check_number, values)
-
-
-def _check_items(check: _Check, values: Any) -> _Bad:
-    for key, value in values.items() if isinstance(values, dict) else enumerate(values):
-        if (bad := check(value)) is not None:
-            return f"[{quoted(key)}]{bad[0]}", bad[1]
-    return None
-
-
-def _check_fields(kind: type[Any], value: Any) -> _Bad:
-    for name, check in _number_fields(kind):
-        if (bad := check(getattr(value, name))) is not None:
-            return f".{name}{bad[0]}", bad[1]
-    return None
-
-
-def _check_union(members: Sequence[tuple[type, _Check]], value: Any) -> _Bad:
-    for cls, check in members:
-        if isinstance(value, cls) and (bad := check(value)) is not None:
-            return bad
+    named = isinstance(numbers, dict)
+    if named:
+        parts = ((name, one, getattr(value, name)) for name, one in numbers.items())
+    elif numbers:
+        keys, items = (value, value.values()) if isinstance(value, dict) else (count(), value)
+        if _numbers_in(numbers[0]) is float and all(abs(item) <= MAX_NUMBER for item in items):
+            return None
+        parts = zip(keys, repeat(numbers[0]), items)
+    else:
+        return None
+    for key, one, part in parts:
+        if (bad := _strange(one, part)) is not None:
+            return (f".{key}" if named else f"[{quoted(key)}]") + bad[0], bad[1]
     return None
 
 

@@ -22,7 +22,7 @@ from splatseg.core.boundary import boundary
 from splatseg.core.scans import LabelledMesh, LabelledPoints
 from splatseg.errors import FileFormatError, InputError, quoted
 from splatseg.io.arrays import read_npz
-from splatseg.io.foreign import expect, made_from
+from splatseg.io.foreign import derived_from, expect
 from splatseg.io.ply import PlyLists, PlyTable, read_ply_header, read_ply_tables
 
 _FACES = ("vertex_indices", "vertex_index")
@@ -65,12 +65,12 @@ def read_surface(
         normals = None
         if set(_NORMALS) <= set(tables["vertex"].numbers):
             normals = _positions(tables["vertex"], _NORMALS)
-        with made_from(path):
+        with derived_from(path):
             return LabelledPoints(points=vertices, labels=labels, normals=normals)
     of_faces = _labels(path, tables["face"], zero_is_class=zero_is_class, void=void)
     expect(labels or of_faces, path, f"vertices or faces with ids, got neither{_seen(tables)}")
     faces, source = _triangles(path, tables["face"])
-    with made_from(path):
+    with derived_from(path):
         return LabelledMesh(
             vertices=vertices,
             faces=faces,
@@ -181,7 +181,7 @@ def _from_arrays(path: Path, *, zero_is_class: bool, void: int | None) -> Labell
                 values, where=f"{path}: {name}", zero_is_class=zero_is_class, void=void
             )
     expect(labels, path, f"ids under {' or '.join(_ARRAYS)}, got none")
-    with made_from(path):
+    with derived_from(path):
         try:
             normals = arrays.get("normal")
             return LabelledPoints(

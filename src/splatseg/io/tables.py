@@ -9,7 +9,7 @@ from typing import Annotated, Any
 from msgspec import Meta
 
 from splatseg.core import ClassInfo, ClassTable
-from splatseg.io.foreign import made_from
+from splatseg.io.foreign import derived_from
 from splatseg.io.schema import structured
 
 _FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n", "\uff1d", "\uff0b", "\uff0d", "\uff20", "'")
@@ -57,12 +57,12 @@ def class_table(rows: object, *, where: str, keep_zero: bool = False) -> ClassTa
     classes: list[ClassInfo] = []
     for i, row in enumerate(structured(rows, list[_Row], where=f"{where}: classes")):
         if keep_zero or row.id != 0:
-            with made_from(f"{where}: classes[{i}]"):
+            with derived_from(f"{where}: classes[{i}]"):
                 thing = bool(row.isthing)
                 classes.append(
                     ClassInfo(id=row.id, name=row.name, isthing=thing, colour=row.colour)
                 )
-    with made_from(where):
+    with derived_from(where):
         return ClassTable(rows=tuple(classes))
 
 

@@ -112,8 +112,7 @@ class AffinityHead:
 
     where the gate g keeps the channels that matter at the scale s of what is looked for: 0 the
     smallest things of the scene, 1 the largest. Scales mean the same in every scene: they are
-    levels (0 parts, 0.5 objects, 1 groups), or ranks of size: `AffinityHead.scale_of` has these of
-    lengths.
+    levels (0 parts, 0.5 objects, 1 groups), or ranks of size.
     """
 
     channels: Count
@@ -171,18 +170,6 @@ class AffinityHead:
         check_range("granularity", granularity, 0.0, 1.0)
         return float(np.interp(granularity, (0.0, 0.5, 1.0), self.levels))
 
-    def scale_of(self, length: float) -> float:
-        """The scale in [0, 1] of a length in scene units: its rank among the scales of masks.
-
-        Raises:
-            InputError: If no scales were measured.
-            RangeError: If the length is negative or not finite.
-        """
-        if self.scale_quantiles is None:
-            raise InputError("scale_of: expected features with measured scales, got others.")
-        check_range("length", length, 0.0, float(np.finfo(np.float64).max))
-        return scale_rank(self.scale_quantiles, length)
-
     def gate(self, scale: float) -> Float[Tensor, "channels"]:
         """The gate g of a scale in [0, 1]; ones where there is none.
 
@@ -201,7 +188,7 @@ class AffinityHead:
 
         Args:
             features: Of Gaussians, or rendered; the zero vector stays zero.
-            scale: In [0, 1], see `scale` and `scale_of`.
+            scale: In [0, 1], see `scale`.
         """
         check_shape("features", features, (*features.shape[:-1], self.channels))
         return normalize(features * self.gate(scale).to(features), dim=-1)
@@ -265,22 +252,6 @@ class AffinityHead:
             raise InputError(
                 f"features: expected an affinity head, got one that cannot be read ({error})."
             ) from error
-
-
-def scale_rank(quantiles: Float64[Tensor, "quantiles"], length: float) -> float:
-    """Where a length lies among quantiles, in [0, 1], linear between two of them.
-
-    Of equal quantiles the last counts, so that lengths that many masks have are no smaller than
-    each of them.
-    """
-    values = quantiles.numpy()
-    after = int(np.searchsorted(values, length, side="right"))
-    if after == 0:
-        return 0.0
-    if after == len(values):
-        return 1.0
-    low, high = float(values[after - 1]), float(values[after])
-    return (after - 1 + (length - low) / (high - low)) / (len(values) - 1)
 
 
 def _check_projector(arrays: Mapping[str, Tensor], channels: int) -> None:

@@ -35,7 +35,7 @@ from splatseg.core import Gaussians
 from splatseg.core.rigid import upright
 from splatseg.core.sh import base_colours
 from splatseg.lift.vocabulary import Vocabulary
-from splatseg.lift.words import TEMPERATURE, WordAnswers
+from splatseg.lift.words import TEMPERATURE, WordMatches
 
 Relation = Literal["on", "near"]
 
@@ -320,8 +320,8 @@ def sureness(
     return (sure * (scores - scores[best]).exp()).clamp(0, 1)
 
 
-def answer_phrases(
-    answers: WordAnswers,
+def match_phrases(
+    answers: WordMatches,
     looks: Callable[[], ThingLooks],
     vocabulary: Vocabulary,
     ask: Callable[[str], Float[Tensor, "k"]],

@@ -71,7 +71,7 @@ OVERLAP = 8
 """Scans on either side of a window that are looked at with it."""
 
 SIGHT_TOLERANCE = 0.1
-"""Tau of `points_in_sight`, metres: noise of a laser, and of depth maps."""
+"""Tau of `points_in_view`, metres: noise of a laser, and of depth maps."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -85,7 +85,7 @@ class SeenPoints:
     """Their z-depth, float64."""
 
 
-def seen_points(
+def visible_points(
     points: Float[Tensor, "n 3"],
     camera: Camera,
     depth: Float[Tensor, "height width"],
@@ -115,7 +115,7 @@ def seen_points(
 
 
 @boundary
-def points_in_sight(
+def points_in_view(
     points: Float[Tensor, "n 3"],
     views: Iterable[tuple[Camera, Float[Tensor, "height width"]]],
     *,
@@ -140,7 +140,7 @@ def points_in_sight(
     for camera, depth in views:
         check_shape("depth", depth, (camera.height, camera.width))
         left = torch.nonzero(~found).squeeze(1)
-        seen = seen_points(
+        seen = visible_points(
             at[left],
             camera,
             depth,
@@ -155,7 +155,7 @@ _NEAR = 1e-3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class SeenView:
+class PointView:
     """What a view of a field shows: labels, and where."""
 
     camera: Camera
@@ -168,7 +168,7 @@ class SeenView:
 
 
 def view_votes(
-    views: Iterable[SeenView],
+    views: Iterable[PointView],
     points: Float[Tensor, "n 3"],
     labels: int,
     *,
@@ -186,7 +186,7 @@ def view_votes(
     flat = votes.view(-1)
     at, full_distance = points.double(), FULL_DISTANCE / metres_per_unit
     for view in views:
-        seen = seen_points(
+        seen = visible_points(
             at,
             view.camera,
             view.depth,
@@ -277,7 +277,7 @@ class ViewedPoints:
         self._cameras = tuple(cameras)
         self._options = options or ViewedPointOptions()
         self._unit = metres_per_unit
-        self._drawn: OrderedDict[tuple[str, int], SeenView] = OrderedDict()
+        self._drawn: OrderedDict[tuple[str, int], PointView] = OrderedDict()
 
     @property
     def layer_names(self) -> Sequence[str]:
@@ -374,7 +374,7 @@ class ViewedPoints:
         )
         return _Cloud(cells=cells, shapes=shapes, votes=votes)
 
-    def _seen(self, layer: str, index: int, ids: tuple[int, ...]) -> SeenView:
+    def _seen(self, layer: str, index: int, ids: tuple[int, ...]) -> PointView:
         """What a view shows, drawn once while memory lasts."""
         key = (layer, index)
         if key in self._drawn:
@@ -385,7 +385,7 @@ class ViewedPoints:
             signals = view.signals(colour=False)
             shown = view.label_map(layer).ids.cpu()
         depth = signals.depth if signals.median_depth is None else signals.median_depth
-        seen = SeenView(camera=camera, columns=_columns(shown, ids), depth=depth.float())
+        seen = PointView(camera=camera, columns=_columns(shown, ids), depth=depth.float())
         self._drawn[key] = seen
         size = 8 * camera.width * camera.height
         while len(self._drawn) > 1 and len(self._drawn) * size > self._options.memory:

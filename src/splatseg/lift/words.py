@@ -35,7 +35,6 @@ from torch import Tensor
 from splatseg._check import check_finite, check_shape
 from splatseg.core import UNLABELLED, Features
 from splatseg.core.boundary import boundary, convert_fields
-from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.lift.vocabulary import TextSpace, Vocabulary
 
@@ -105,12 +104,11 @@ class WordSpan:
             ShapeError: If widths do not fit.
         """
         check_shape("words", words, (None, self.space.width))
-        with one_torch_thread():
-            features = _unit(self.space.expand(values.float()) @ self.directions.T)
-            inside = _unit(words.float()) @ self.directions.T
-            energy = inside.norm(dim=1)
-            kept = energy / (energy.square() + min_energy**2).sqrt().clamp_min(_TINY)
-            return features @ (_unit(inside) * kept[:, None]).T
+        features = _unit(self.space.expand(values.float()) @ self.directions.T)
+        inside = _unit(words.float()) @ self.directions.T
+        energy = inside.norm(dim=1)
+        kept = energy / (energy.square() + min_energy**2).sqrt().clamp_min(_TINY)
+        return features @ (_unit(inside) * kept[:, None]).T
 
 
 def _unit(vectors: Tensor) -> Tensor:
@@ -146,11 +144,10 @@ def word_span(
     check_finite("weights", weights)
     if not bool((weights > 0).any()) or bool((weights < 0).any()):
         raise RangeError("weights: expected at least 0, and one above 0.")
-    with one_torch_thread():
-        counted = weights.double().clamp_max(FULL_WEIGHT)
-        full = _unit(space.expand(values.float()).double())
-        moment = (full * counted[:, None]).T @ full
-        found, axes = torch.linalg.eigh(moment)
+    counted = weights.double().clamp_max(FULL_WEIGHT)
+    full = _unit(space.expand(values.float()).double())
+    moment = (full * counted[:, None]).T @ full
+    found, axes = torch.linalg.eigh(moment)
     found, axes = found.flip(0)[:components], axes.flip(1)[:, :components]
     # Signs are the solver's own; the largest entry of each is positive.
     largest = axes.abs().argmax(dim=0)
@@ -164,7 +161,7 @@ _AT_ONCE = 65_536
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class WordAnswers:
+class WordMatches:
     """What features answer to words."""
 
     words: tuple[str, ...]
@@ -186,12 +183,12 @@ def context_of(vocabulary: Vocabulary) -> tuple[str, ...]:
 
 
 @boundary
-def answer_words(
+def match_words(
     values: Float[Tensor, "n channels"],
     words: Sequence[str],
     vocabulary: Vocabulary,
     span: WordSpan,
-) -> WordAnswers:
+) -> WordMatches:
     """Ask features, of objects or of Gaussians, for words.
 
     The result does not depend on the number of threads.
@@ -207,16 +204,15 @@ def answer_words(
         ShapeError: If widths do not fit.
     """
     others = context_of(vocabulary)
-    with one_torch_thread():
-        asked = vocabulary.vectors(words)
-        rivals = vocabulary.vectors(others) if others else asked[:0]
-        held = (rivals @ asked.T) < SAME_MEANING
-        parts = [
-            _answered(part, asked=asked, rivals=rivals, held=held, span=span)
-            for part in values.split(_AT_ONCE)
-        ]
+    asked = vocabulary.vectors(words)
+    rivals = vocabulary.vectors(others) if others else asked[:0]
+    held = (rivals @ asked.T) < SAME_MEANING
+    parts = [
+        _answered(part, asked=asked, rivals=rivals, held=held, span=span)
+        for part in values.split(_AT_ONCE)
+    ]
     cosines = torch.cat([part[0] for part in parts])
-    return WordAnswers(
+    return WordMatches(
         words=tuple(word.strip() for word in words),
         cosines=cosines,
         probabilities=torch.cat([part[1] for part in parts]),
@@ -288,9 +284,9 @@ class WordIndex:
         return self._rows
 
     @boundary
-    def ask(self, words: Sequence[str]) -> WordAnswers:
-        """What each vector answers, see `answer_words`."""
-        return answer_words(self.values, words, self.vocabulary, self.span)
+    def ask(self, words: Sequence[str]) -> WordMatches:
+        """What each vector answers, see `match_words`."""
+        return match_words(self.values, words, self.vocabulary, self.span)
 
     @boundary
     def of_gaussians(self, found: Shaped[Tensor, "k words"]) -> Shaped[Tensor, "n words"]:

@@ -10,6 +10,4 @@ from splatseg.methods._method import keeps_boundaries as keeps_boundaries
 from splatseg.methods._method import keeps_ids as keeps_ids
 from splatseg.methods._method import method_names as method_names
 from splatseg.methods._method import methods as methods
-from splatseg.methods._method import methods_table as methods_table
 from splatseg.methods._method import register_method as register_method
-from splatseg.methods._method import with_table as with_table

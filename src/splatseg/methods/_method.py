@@ -1,7 +1,7 @@
 """What a method declares of itself; flags, help, documentation and refusals follow from it."""
 
 import difflib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Literal, cast
@@ -9,7 +9,7 @@ from typing import Any, Literal, cast
 from splatseg.core import ClassTable, Features, Gaussians, Layer, View
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.checkpoints import Checkpoints
-from splatseg.errors import FileFormatError, InputError, MissingPackageError
+from splatseg.errors import InputError, MissingPackageError
 from splatseg.io.evidence import Evidence, EvidenceKind, FeatureEvidence, TrackedEvidence
 
 ANY_COMPANION = "any"
@@ -355,33 +355,3 @@ def _known() -> dict[str, EntryPoint]:
     others = {entry.name: entry for entry in entry_points(group=ENTRY_POINT_GROUP)}
     # Another package cannot take the place of a method of ours.
     return own | {name: others[name] for name in sorted(others) if name not in own}
-
-
-BEGIN = "<!-- methods: made by scripts/methods_table -->"
-END = "<!-- end of methods -->"
-
-
-@boundary
-def methods_table(methods: Sequence[Method]) -> str:
-    """A Markdown table, a row a method."""
-    rows = [
-        f"| `{method.name}` | {', '.join(method.evidence)} | {method.returns} | {method.summary} "
-        f"| {method.reference} |"
-        for method in methods
-    ]
-    head = ["| method | evidence | gives | what it does | reference |", "| --- " * 5 + "|"]
-    return "\n".join([*head, *rows])
-
-
-@boundary
-def with_table(text: str, table: str) -> str:
-    """A page with the table between its two marks.
-
-    Raises:
-        FileFormatError: If the marks are not there.
-    """
-    before, mark, rest = text.partition(BEGIN)
-    _, end, after = rest.partition(END)
-    if not (mark and end):
-        raise FileFormatError(f"expected the marks {BEGIN!r} and {END!r}, got a page without.")
-    return f"{before}{BEGIN}\n{table}\n{END}{after}"

@@ -43,7 +43,6 @@ from splatseg.core import (
 )
 from splatseg.core.boundary import boundary
 from splatseg.core.options import options as options_class
-from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError, ShapeError
 from splatseg.lift.label_maps import label_map
 from splatseg.lift.segments import EvidenceSegments
@@ -336,9 +335,8 @@ class _NormalEquations:
         """X (count, channels), and the share of the squares, in [0, 1], that is left over."""
         mean = self._features / max(self._cells, 1)
         count = len(self._right)
-        with one_torch_thread():
-            factors = splu((self._matrix + RIDGE * sparse.identity(count)).tocsc())
-            found = factors.solve(self._right + RIDGE * mean)
+        factors = splu((self._matrix + RIDGE * sparse.identity(count)).tocsc())
+        found = factors.solve(self._right + RIDGE * mean)
         product = self._matrix @ found
         left = self._squares - 2 * float((found * self._right).sum())
         left += float((found * product).sum())

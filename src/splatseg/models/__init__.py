@@ -3,9 +3,8 @@
 Models see images and give evidence; they never see Gaussians. See ``docs/models.md``.
 """
 
-from splatseg.models._cache import ModelCache as ModelCache
+from splatseg.models._record import DescribedEvidence as DescribedEvidence
 from splatseg.models._record import EvidenceRequest as EvidenceRequest
-from splatseg.models._record import SeenEvidence as SeenEvidence
 from splatseg.models._record import record_evidence as record_evidence
 from splatseg.models._registry import ENTRY_POINT_GROUP as ENTRY_POINT_GROUP
 from splatseg.models._registry import find_family as find_family

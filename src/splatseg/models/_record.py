@@ -36,7 +36,6 @@ from splatseg.io.evidence import (
     view_files,
 )
 from splatseg.io.json_files import json_text, parse_object
-from splatseg.models._cache import ModelCache
 from splatseg.models._tracked import TrackingEvidence, TrackingOptions
 from splatseg.models._weights import What
 from splatseg.models._written import (
@@ -77,9 +76,6 @@ class EvidenceRequest:
     allow_missing: bool = False
     """Take the views that recorded evidence has, where some are missing."""
 
-    cache: ModelCache | None = None
-    """Where to look before the model is run."""
-
     seeds: Evidence | None = None
     """Objects that a tracker follows: evidence of masks, panoptic segments, labels or tracks.
     Tracks are asked for alone, and are written whole or not at all."""
@@ -94,7 +90,7 @@ class EvidenceRequest:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SeenEvidence:
+class DescribedEvidence:
     """What was written."""
 
     folder: Path
@@ -120,7 +116,7 @@ class SeenEvidence:
     notes: tuple[str, ...]
     """What the user should know of the evidence, a sentence each."""
 
-    further: tuple["SeenEvidence", ...] = ()
+    further: tuple["DescribedEvidence", ...] = ()
     """What was written beside it, where several kinds were asked for."""
 
 
@@ -132,7 +128,7 @@ def record_evidence(
     request: EvidenceRequest = EvidenceRequest(),
     *,
     progress: Callable[[int, int], None] | None = None,
-) -> SeenEvidence:
+) -> DescribedEvidence:
     """Write what a model sees in views, one view at a time; a second call does what is left.
 
     A recorded model's evidence is checked and copied; no photograph is read for it. If it fails,
@@ -212,8 +208,6 @@ def _writers(
     ]:
         if len(questions) > 1:
             raise InputError("what: expected tracked alone, since views come in its order.")
-        if request.cache is not None:
-            raise InputError("cache: keeps answers to single photographs, got a tracker's.")
         options = request.tracking or TrackingOptions()
         tracker = cast(MaskTracker, model)
         return [
@@ -226,10 +220,7 @@ def _writers(
     if isinstance(model, RecordedModel):
         missing = request.allow_missing
         return [CopiedEvidence(model, views, one, allow_missing=missing) for one in questions]
-    return [
-        ComputedEvidence(model, views, one, cache=request.cache, pictures=pictures)
-        for one in questions
-    ]
+    return [ComputedEvidence(model, views, one, pictures=pictures) for one in questions]
 
 
 def _check_apart(target: Path, reads: Path | None) -> None:
@@ -264,9 +255,9 @@ class _Target:
         self.writer.finish(self.folder)
         _write_header(self.folder, self.writer, {**self.metadata, "complete": True})
 
-    def seen(self, model: str, seconds: float) -> SeenEvidence:
+    def seen(self, model: str, seconds: float) -> DescribedEvidence:
         files = (path for path in self.target.rglob("*") if path.is_file())
-        return SeenEvidence(
+        return DescribedEvidence(
             folder=self.target,
             model=model,
             kind=self.writer.kind,

@@ -37,7 +37,7 @@ def find_family(name: str) -> ModelFamily | None:
         MissingPackageError: If the package that brings it cannot be imported.
     """
     if name in _ROWS:
-        return own_family(name)
+        return family_of_sam(name)
     others = _others()
     if name not in others:
         names = model_names()
@@ -172,7 +172,7 @@ class _Row:
 
 
 @functools.cache
-def own_family(name: str) -> ModelFamily:
+def family_of_sam(name: str) -> ModelFamily:
     """A family of this package; imports its module."""
     row = _ROWS[name]
     module, _, maker = row.make.partition(":")

@@ -25,7 +25,7 @@ from splatseg.io.evidence import (
     save_label_map,
     save_tracks,
 )
-from splatseg.models._written import EvidenceWriter, Pictures, check_answer, some
+from splatseg.models._written import EvidenceWriter, Pictures, check_output, some
 from splatseg.models.recorded import check_size
 
 _NUMBER = re.compile(r"(\d+)")
@@ -362,7 +362,7 @@ class TrackingEvidence(EvidenceWriter):
         found = next(maps, None)
         if found is None or found[0] != view.name:
             raise self._out_of_step(view.name, "none" if found is None else repr(found[0]))
-        check_answer(self._model, view, found[1])
+        check_output(self._model, view, found[1])
         return LabelMap(ids=found[1].ids.cpu())
 
     def _out_of_step(self, due: str, got: str) -> InputError:

@@ -5,7 +5,6 @@ unless it is asked for; then size and licence are said first.
 """
 
 import hashlib
-import importlib
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -21,8 +20,8 @@ from splatseg.errors import (
     FileFormatError,
     InputError,
     MissingFileError,
-    MissingPackageError,
     brief,
+    import_package,
     quoted,
 )
 from splatseg.io.foreign import is_file
@@ -446,12 +445,5 @@ def _described(known: Checkpoint | None) -> str:
 
 
 def _hub() -> Any:
-    try:
-        huggingface_hub = importlib.import_module("huggingface_hub")
-        importlib.import_module("huggingface_hub.errors")
-    except ImportError as error:
-        raise MissingPackageError(
-            "weights of the Hugging Face hub need a package that is not installed "
-            "(huggingface_hub). Try: pip install 'splatseg[models]'."
-        ) from error
-    return huggingface_hub
+    import_package("huggingface_hub.errors", "the hub of Hugging Face", "models")
+    return import_package("huggingface_hub", "the hub of Hugging Face", "models")

@@ -50,18 +50,17 @@ from splatseg.io.evidence import (
 )
 from splatseg.io.images import load_image
 from splatseg.io.json_files import read_json, write_json
-from splatseg.models._cache import METHODS, ModelCache
 from splatseg.models.networks._words import word_vectors
 from splatseg.models.recorded import RecordedModel, check_grid, check_size
 
-_QUESTIONS: dict[str, tuple[type[Any], EvidenceKind]] = {
-    "masks": (AutomaticMasks, "masks"),
-    "panoptic": (PanopticSegments, "panoptic"),
-    "labels": (SemanticLabels, "labels"),
-    "text": (TextFeatures, "features"),
-    "features": (DenseFeatures, "features"),
-    "depth": (DenseDepth, "depth"),
-    "tracked": (MaskTracker, "tracked"),
+_QUESTIONS: dict[str, tuple[type[Any], EvidenceKind, str]] = {
+    "masks": (AutomaticMasks, "masks", "masks"),
+    "panoptic": (PanopticSegments, "panoptic", "panoptic"),
+    "labels": (SemanticLabels, "labels", "label_map"),
+    "text": (TextFeatures, "features", "text_features"),
+    "features": (DenseFeatures, "features", "features"),
+    "depth": (DenseDepth, "depth", "depth_map"),
+    "tracked": (MaskTracker, "tracked", "track"),
 }
 """The protocol of a question and the kind of evidence that it makes, the most telling first."""
 
@@ -173,7 +172,7 @@ def ability(model: Model, what: str | None) -> str:
     Raises:
         InputError: If the model cannot give this, or nothing at all.
     """
-    can = [one for one, (protocol, _) in _QUESTIONS.items() if isinstance(model, protocol)]
+    can = [one for one, (protocol, *_) in _QUESTIONS.items() if isinstance(model, protocol)]
     if not can:
         raise InputError(f"model {model.name!r}: expected one that gives evidence of views.")
     if what is None:
@@ -208,24 +207,18 @@ def announce(
     images: list[Image] = []
     for writer, folder in targets:
         if isinstance(writer, ComputedEvidence):
-            images = max(images, writer.announced(views, folder), key=len)
+            images = [writer.pictures.of(view, folder) for view in views]
     if len({tuple(image.shape) for image in images}) == 1:
         model.encode(images)
 
 
 class ComputedEvidence(EvidenceWriter):
-    """Evidence of a model that is run on pictures of views, directly or through a cache."""
+    """Evidence of a model that is run on pictures of views."""
 
     keep_partial = True
 
     def __init__(
-        self,
-        model: Any,
-        views: Sequence[View],
-        what: str | None,
-        *,
-        cache: ModelCache | None,
-        pictures: Pictures,
+        self, model: Any, views: Sequence[View], what: str | None, *, pictures: Pictures
     ) -> None:
         self.views = views
         self.details = {}
@@ -234,8 +227,7 @@ class ComputedEvidence(EvidenceWriter):
         if self.what in ("labels", "panoptic"):
             self.classes = model.classes if self.what == "labels" else model.categories
         self._model = model
-        self._cache = cache
-        self._pictures = pictures
+        self.pictures = pictures
         self._counts: dict[str, int] = {}
         """Masks by view, for the notes."""
 
@@ -248,16 +240,13 @@ class ComputedEvidence(EvidenceWriter):
 
     @override
     def write(self, folder: Path, view: View) -> int:
-        image = self._pictures.of(view, folder)
-        if self._cache is None:
-            found = getattr(self._model, METHODS[self.what])(image)
-        else:
-            found = self._cache.ask(self.what, self._model, image)
+        image = self.pictures.of(view, folder)
+        found = getattr(self._model, _QUESTIONS[self.what][2])(image)
         maps: Sequence[Any] = (found,)
         if isinstance(found, DeepFeatures | Panoptic):
             maps = found.maps if isinstance(found, DeepFeatures) else (found.ids,)
         for one in maps:
-            check_answer(self._model, view, one)
+            check_output(self._model, view, one)
         if isinstance(found, MaskSet):
             masks = without_empty(found)
             save_masks(masks, folder, view.name)
@@ -295,15 +284,8 @@ class ComputedEvidence(EvidenceWriter):
             return ()
         return (f"{len(none)} of {len(self._counts)} views have no mask at all ({some(none)}).",)
 
-    def announced(self, views: Sequence[View], folder: Path) -> list[Image]:
-        """Pictures of views that are asked about next, and that no cache answers for."""
-        images = [self._pictures.of(view, folder) for view in views]
-        if self._cache is None:
-            return images
-        return [i for i in images if not self._cache.entry(self.what, self._model, i).is_file()]
 
-
-def check_answer(model: Model, view: View, found: Any) -> None:
+def check_output(model: Model, view: View, found: Any) -> None:
     """Refuse what has not the photograph's size."""
     camera = view.camera
     if (found.height, found.width) != (camera.height, camera.width):

@@ -5,29 +5,22 @@ shows is told by its name (``view="..."``) or found by the image's content among
 of the views that the model was opened with.
 """
 
-from abc import ABC
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
-from splatseg.core import ClassTable, DepthMap, FeatureMap, LabelMap, MaskSet, View
+from splatseg.core import FeatureMap, MaskSet, View
 from splatseg.core.boundary import boundary
-from splatseg.core.models import DeepFeatures, Embedding, Image, Panoptic, Prompt
-from splatseg.errors import FileFormatError, InputError, ShapeError
-from splatseg.io.annotations import AnnotationEvidence, open_annotations
+from splatseg.core.models import Embedding, Image, Prompt
+from splatseg.errors import FileFormatError, InputError
+from splatseg.io.annotations import open_annotations
 from splatseg.io.evidence import (
-    TEXT_FILE,
     Evidence,
     EvidenceKind,
     FeatureEvidence,
-    PanopticEvidence,
-    TextEmbeddings,
-    load_text_embeddings,
     open_evidence,
 )
 from splatseg.io.images import load_image
@@ -68,11 +61,13 @@ class ViewsByContent:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class RecordedModel(ABC):
-    """A model that answers from a folder of evidence. What it answers is its subclass's."""
+class RecordedModel:
+    """Evidence that others recorded, in the place of a model: `record_evidence` copies it."""
 
     evidence: Evidence
     views: ViewsByContent
+    """Of the scene, among which a photograph is found."""
+
     reading: Mapping[str, Any]
     """How its files are read, where that can be told: zero_is_class and void."""
 
@@ -98,15 +93,8 @@ class RecordedModel(ABC):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class RecordedMaskModel(RecordedModel):
-    """Recorded evidence with masks: automatic, and promptable by choice among them."""
-
-    def masks(self, image: Image, *, view: str | None = None) -> MaskSet:
-        """The recorded masks of the view; of a label map a mask an id."""
-        name = self.view_of(image, view)
-        masks = self.evidence.masks(name)
-        check_size(self.evidence, name, (masks.height, masks.width), image)
-        return masks
+class RecordedMasks(RecordedModel):
+    """Recorded masks, or segments of label maps: promptable by choice among them."""
 
     def embed(self, image: Image, *, view: str | None = None) -> Embedding:
         """Remember which view is meant, which is all there is to know."""
@@ -126,20 +114,13 @@ class RecordedMaskModel(RecordedModel):
             raise InputError("embedding: expected one with the name of a view, got none.")
         return best_masks(self.evidence.masks(embedding.view), prompt)
 
-    def recorded_label_map(self, image: Image, view: str | None) -> LabelMap:
-        """The label map of a view, after a check of its size."""
-        name = self.view_of(image, view)
-        ids = self.evidence.label_map(name)
-        check_size(self.evidence, name, (ids.height, ids.width), image)
-        return ids
-
 
 def check_size(
-    evidence: Evidence, name: str, size: tuple[int, int], image: Image | tuple[int, int]
+    evidence: Evidence, name: str, size: tuple[int, int], photograph: tuple[int, int]
 ) -> None:
     """Raise `FileFormatError` unless what was recorded of a view has the photograph's size."""
-    height, width = (int(s) for s in (image if isinstance(image, tuple) else image.shape)[:2])
-    if size != (height, width):
+    height, width = photograph
+    if size != photograph:
         raise FileFormatError(
             f"{evidence.folder}: view {name!r}: expected {width}x{height} pixels as the photograph "
             f"has, got {size[1]}x{size[0]}."
@@ -199,58 +180,11 @@ def _fit(masks: MaskSet, index: int, prompt: Prompt) -> float:
     return fit
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class RecordedFeatures(RecordedModel):
-    """Recorded features of a network, at one or several depths."""
-
-    evidence: FeatureEvidence
-
-    def features(self, image: Image, *, view: str | None = None) -> DeepFeatures:
-        """The recorded features of the view, all depths, and the class token."""
-        evidence = self.evidence
-        name = self.view_of(image, view)
-        deep = evidence.deep_features(name)
-        for one in deep.maps:
-            check_grid(evidence, name, one, image)
-        return deep
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class RecordedTextFeatures(RecordedModel):
-    """Recorded features in the space of words, with recorded words."""
-
-    evidence: FeatureEvidence
-
-    words: TextEmbeddings
-    """The words that can be asked for."""
-
-    def text_features(self, image: Image, *, view: str | None = None) -> FeatureMap:
-        """Unit vectors of the cells of the view, at full width."""
-        evidence = self.evidence
-        name = self.view_of(image, view)
-        recorded = evidence.features(name)
-        check_grid(evidence, name, recorded, image)
-        full = recorded.features if evidence.basis is None else evidence.expand(recorded.features)
-        return FeatureMap(
-            features=torch.nn.functional.normalize(full, dim=-1),
-            stride=recorded.stride,
-            height=recorded.height,
-            width=recorded.width,
-        )
-
-    def encode_text(self, words: Sequence[str]) -> Float[Tensor, "n width"]:
-        """The recorded vectors of words; a word that was not recorded is an `InputError`."""
-        if not words:
-            return torch.zeros(0, self.words.vectors.shape[1])
-        vectors = torch.stack([self.words.vector(word) for word in words])
-        return torch.nn.functional.normalize(vectors, dim=-1)
-
-
 def check_grid(
-    evidence: FeatureEvidence, name: str, features: FeatureMap, image: Image | tuple[int, int]
+    evidence: FeatureEvidence, name: str, features: FeatureMap, photograph: tuple[int, int]
 ) -> None:
     """Raise `FileFormatError` unless a grid of features covers the photograph, and no more."""
-    height, width = (int(s) for s in (image if isinstance(image, tuple) else image.shape)[:2])
+    height, width = photograph
     rows, columns = (int(s) for s in features.features.shape[:2])
     stride = features.stride
     # Networks drop or pad what does not fill a cell.
@@ -259,86 +193,6 @@ def check_grid(
             f"{evidence.folder}: view {name!r}: expected cells of {stride} pixels that cover a "
             f"photograph of {width}x{height}, got {columns}x{rows} cells."
         )
-
-
-def recorded_words(evidence: FeatureEvidence) -> TextEmbeddings | None:
-    """The words whose vectors are as wide as the features: in their folder, or beside it.
-
-    Raises:
-        ShapeError: If components of features are of another width than the words there.
-    """
-    if evidence.basis is None and evidence.scale is not None:
-        return None
-    for folder in (evidence.folder, evidence.folder.absolute().parent):
-        if (folder / TEXT_FILE).is_file():
-            words = load_text_embeddings(folder / TEXT_FILE)
-            width = words.vectors.shape[1]
-            if evidence.basis is not None:
-                if evidence.basis.shape[1] != width:
-                    raise ShapeError(
-                        f"{folder / TEXT_FILE}: expected vectors of {evidence.basis.shape[1]} "
-                        f"numbers as the features have, got {width}."
-                    )
-                return words
-            first = evidence.features(evidence.view_names[0])
-            return words if first.channels == width else None
-    return None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class RecordedLabels(RecordedMaskModel):
-    """Recorded label maps whose ids mean the same in all views."""
-
-    @property
-    def classes(self) -> ClassTable | None:
-        """Names of the ids."""
-        return self.evidence.classes
-
-    def label_map(self, image: Image, *, view: str | None = None) -> LabelMap:
-        """The recorded label map of the view."""
-        return self.recorded_label_map(image, view)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class RecordedPanoptic(RecordedMaskModel):
-    """Recorded segments with their classes."""
-
-    evidence: PanopticEvidence | AnnotationEvidence
-
-    @property
-    def categories(self) -> ClassTable | None:
-        """Names of the segments' classes."""
-        return self.evidence.classes
-
-    def panoptic(self, image: Image, *, view: str | None = None) -> Panoptic:
-        """The recorded segments of the view."""
-        name = self.view_of(image, view)
-        return Panoptic(
-            ids=self.recorded_label_map(image, name), segments=self.evidence.segments(name)
-        )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class RecordedTracks(RecordedMaskModel):
-    """Recorded tracks: the label maps of a tracker, in the order it went."""
-
-    def track(
-        self, frames: Iterable[tuple[str, Image]], seeds: Mapping[str, LabelMap]
-    ) -> Iterator[tuple[str, LabelMap]]:
-        """The recorded ids of each frame; seeds must be empty, since nothing can be added."""
-        if seeds:
-            raise InputError(f"seeds: expected none for recorded tracks, got {len(seeds)}.")
-        for name, image in frames:
-            yield name, self.recorded_label_map(image, name)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class RecordedDepth(RecordedModel):
-    """Recorded depth maps."""
-
-    def depth_map(self, image: Image, *, view: str | None = None) -> DepthMap:
-        """The recorded depth map of the view, at its own size."""
-        return self.evidence.depth_map(self.view_of(image, view))
 
 
 @boundary
@@ -358,8 +212,7 @@ def recorded_model(
     Annotations of another tool (`io.annotations.open_annotations`) are one file, or the folder that
     it exported; their pictures are matched with `views` by name, then by stem.
 
-    Features become `RecordedTextFeatures` where text_embeddings.npz lies in the folder or
-    beside it and its vectors are as wide as the features; else `RecordedFeatures`.
+    Masks, label maps, panoptic segments and tracks answer prompts (`RecordedMasks`).
 
     Args:
         folder: The folder: label maps, panoptic, tracked, masks, features or depth maps; or the
@@ -398,18 +251,5 @@ def recorded_model(
     known: dict[str, Any] = {
         "evidence": evidence, "views": ViewsByContent(tuple(views)), "reading": reading,
     }  # fmt: skip
-    if isinstance(evidence, FeatureEvidence):
-        words = recorded_words(evidence)
-        if words is None:
-            return RecordedFeatures(**known)
-        return RecordedTextFeatures(**known, words=words)
-    return _MODELS[evidence.kind](**known)
-
-
-_MODELS: dict[EvidenceKind, type[RecordedModel]] = {
-    "depth": RecordedDepth,
-    "labels": RecordedLabels,
-    "masks": RecordedMaskModel,
-    "panoptic": RecordedPanoptic,
-    "tracked": RecordedTracks,
-}
+    kept = evidence.kind in ("features", "depth")
+    return RecordedModel(**known) if kept else RecordedMasks(**known)

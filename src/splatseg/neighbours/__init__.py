@@ -1,7 +1,7 @@
 """Radius and k nearest neighbour search over points and centres of Gaussians, exact.
 
-The native search (``native/neighbours.h``) and its readable twin, `neighbours.reference`, which
-compares everything with everything.
+The search is ``native/neighbours.h``; its readable twin, which compares everything with everything,
+is ``tests/support/neighbours_reference.py``.
 """
 
 from splatseg.neighbours._index import NeighbourIndex as NeighbourIndex

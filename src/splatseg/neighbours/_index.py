@@ -118,8 +118,6 @@ class NeighbourIndex:
         tensor([[1, 2]])
         >>> index.nearest_others(1).indices[:, 0]
         tensor([1, 2, 1, 1])
-        >>> index.others_within(1.0).counts
-        tensor([2, 2, 2, 0])
     """
 
     @boundary
@@ -224,7 +222,7 @@ class NeighbourIndex:
             RangeError: If `radius` is negative or NaN, or a query is not finite.
             InputError: If the queries are not of a floating-point type.
         """
-        return self._count(self._queries(queries), None, radius).to(queries.device)
+        return self._counts(self._queries(queries), radius).to(queries.device)
 
     def within(
         self,
@@ -238,7 +236,7 @@ class NeighbourIndex:
 
         Args:
             queries: Positions, in the unit and frame of the points. One of the points finds
-                itself; see `others_within`.
+                itself.
             radius: In the unit of the points, at least 0.
             max_neighbours: Only the nearest so many of each query, at least 1; None for all.
             max_pairs: More than so many pairs of a query and a point, 16 bytes each, are
@@ -254,70 +252,9 @@ class NeighbourIndex:
                 `max_pairs` pairs.
         """
         asked = self._queries(queries)
-        return self._within(asked, None, radius, max_neighbours, max_pairs).to(queries.device)
-
-    def others_within(
-        self,
-        radius: float,
-        *,
-        rows: Int64[Tensor, "m"] | None = None,
-        max_neighbours: int | None = None,
-        max_pairs: int = MAX_PAIRS,
-    ) -> NeighbourLists:
-        """All other points within a radius of points of the index.
-
-        A point leaves itself out by its index: others in the same position are found.
-
-        Args:
-            radius: In the unit of the points, at least 0.
-            rows: Indices of the points that ask; None for all, in their order.
-            max_neighbours: Only the nearest so many of each point, at least 1; None for all.
-            max_pairs: As in `within`.
-
-        Returns:
-            Sparse rows on the device of the points.
-
-        Raises:
-            ShapeError: If `rows` is not (m,).
-            RangeError: If an argument is out of range.
-            InputError: If `rows` are no integers, or there are more than `max_pairs` pairs.
-        """
-        asked = self._rows(rows)
-        return self._within(None, asked, radius, max_neighbours, max_pairs).to(self._device)
-
-    def _nearest(
-        self,
-        queries: Tensor | None,
-        rows: Tensor | None,
-        k: int,
-        max_distance: float,
-        device: torch.device,
-    ) -> Neighbours:
-        _check_count("k", k)
-        _check_distance("max_distance", max_distance)
-        count = self._query_count(queries, rows)
-        indices = torch.empty(count, k, dtype=torch.int64)
-        squared = torch.empty(count, k, dtype=torch.float64)
-        self._native.nearest(queries, rows, max_distance * max_distance, indices, squared)
-        return Neighbours(indices=indices.to(device), distances=square_root(squared).to(device))
-
-    def _count(self, queries: Tensor | None, rows: Tensor | None, radius: float) -> Tensor:
-        _check_distance("radius", radius)
-        counts = torch.empty(self._query_count(queries, rows), dtype=torch.int64)
-        self._native.count_within(queries, rows, radius * radius, counts)
-        return counts
-
-    def _within(
-        self,
-        queries: Tensor | None,
-        rows: Tensor | None,
-        radius: float,
-        max_neighbours: int | None,
-        max_pairs: int,
-    ) -> NeighbourLists:
         if max_neighbours is not None:
             _check_count("max_neighbours", max_neighbours)
-        counts = self._count(queries, rows, radius)
+        counts = self._counts(asked, radius)
         if max_neighbours is not None:
             counts = counts.clamp_max(max_neighbours)
         starts = torch.zeros(len(counts) + 1, dtype=torch.int64)
@@ -331,13 +268,32 @@ class NeighbourIndex:
             )
         indices = torch.empty(pairs, dtype=torch.int64)
         squared = torch.empty(pairs, dtype=torch.float64)
-        self._native.within(queries, rows, radius * radius, starts, indices, squared)
-        return NeighbourLists(starts=starts, indices=indices, distances=square_root(squared))
+        self._native.within(asked, None, radius * radius, starts, indices, squared)
+        found = NeighbourLists(starts=starts, indices=indices, distances=square_root(squared))
+        return found.to(queries.device)
 
-    def _query_count(self, queries: Tensor | None, rows: Tensor | None) -> int:
-        if queries is not None:
-            return len(queries)
-        return len(self) if rows is None else len(rows)
+    def _nearest(
+        self,
+        queries: Tensor | None,
+        rows: Tensor | None,
+        k: int,
+        max_distance: float,
+        device: torch.device,
+    ) -> Neighbours:
+        _check_count("k", k)
+        _check_distance("max_distance", max_distance)
+        asked = queries if queries is not None else rows
+        count = len(self) if asked is None else len(asked)
+        indices = torch.empty(count, k, dtype=torch.int64)
+        squared = torch.empty(count, k, dtype=torch.float64)
+        self._native.nearest(queries, rows, max_distance * max_distance, indices, squared)
+        return Neighbours(indices=indices.to(device), distances=square_root(squared).to(device))
+
+    def _counts(self, queries: Tensor, radius: float) -> Tensor:
+        _check_distance("radius", radius)
+        counts = torch.empty(len(queries), dtype=torch.int64)
+        self._native.count_within(queries, None, radius * radius, counts)
+        return counts
 
     def _queries(self, queries: Tensor) -> Tensor:
         check_shape("queries", queries, (None, self.dimensions))
@@ -438,8 +394,8 @@ class Subset:
 
     It takes its order from the index, so that making one costs a pass over the mask; the index is
     made once for a scene and kept. All answers are exact and do not depend on the number of
-    threads; `neighbours.reference` has their definitions. Radii include their border, as those of
-    `NeighbourIndex` do: :math:`d^2 \le r^2` in float64.
+    threads. Radii include their border, as those of `NeighbourIndex` do:
+    :math:`d^2 \le r^2` in float64.
 
     Args:
         index: An index of points with three columns, of float32 or a narrower type.

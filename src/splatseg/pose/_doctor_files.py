@@ -16,7 +16,7 @@ from splatseg.errors import FileFormatError, InputError
 from splatseg.io.atomic import atomic_folder, is_vacant
 from splatseg.io.cameras import cameras_content
 from splatseg.io.captures import find_formats, read_capture
-from splatseg.io.foreign import is_file, made_from
+from splatseg.io.foreign import derived_from, is_file
 from splatseg.io.images import image_size
 from splatseg.io.json_files import read_json, write_json
 from splatseg.pose._doctor_cameras import PointCorrection
@@ -236,7 +236,7 @@ def _read_with_sizes(
         changed["ply_file_path"] = str(root / points)
     elif beside is not None:
         changed["ply_file_path"] = str(root / beside)
-    with tempfile.TemporaryDirectory() as temporary, made_from(folder):
+    with tempfile.TemporaryDirectory() as temporary, derived_from(folder):
         write_json(changed, Path(temporary) / _TRANSFORMS)
         if (folder / "metadata.json").is_file():
             shutil.copy(folder / "metadata.json", temporary)

@@ -18,6 +18,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 _WORDS = 64
 _ITERATIONS = 8
@@ -49,7 +51,7 @@ def all_pairs(count: int) -> list[tuple[int, int]]:
     return [(i, j) for i in range(count) for j in range(i + 1, count)]
 
 
-def chosen_pairs(
+def selected_pairs(
     alike: NDArray[np.float32], *, overlap: int, neighbours: int
 ) -> list[tuple[int, int]]:
     """Each photograph with those that follow it and those that look most like it, sorted.
@@ -57,7 +59,7 @@ def chosen_pairs(
     Example:
         >>> alike = np.eye(4, dtype=np.float32)
         >>> alike[0, 3] = alike[3, 0] = 0.5
-        >>> chosen_pairs(alike, overlap=1, neighbours=1)
+        >>> selected_pairs(alike, overlap=1, neighbours=1)
         [(0, 1), (0, 3), (1, 2), (2, 3)]
     """
     count = len(alike)
@@ -96,18 +98,9 @@ def connected_groups(count: int, pairs: Sequence[tuple[int, int]]) -> list[int]:
         >>> connected_groups(4, [(0, 2), (2, 3)])
         [0, 1, 0, 0]
     """
-    root = list(range(count))
-
-    def find(i: int) -> int:
-        while root[i] != i:
-            root[i] = root[root[i]]
-            i = root[i]
-        return i
-
-    for i, j in pairs:
-        low, high = sorted((find(i), find(j)))
-        root[high] = low
-    return [find(i) for i in range(count)]
+    one, other = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
+    links = coo_matrix((np.ones(len(one)), (one, other)), shape=(count, count))
+    return connected_components(links, directed=False)[1].tolist()
 
 
 def _sample(rows: NDArray[Any], count: int, rng: np.random.Generator) -> NDArray[Any]:

@@ -22,13 +22,12 @@ from splatseg.core.models import Image, Pointmap, PointmapModel
 from splatseg.core.options import Count, Natural, options
 from splatseg.errors import InputError, quoted
 from splatseg.io.pointmaps import RecordedPointmaps, create_pointmaps
-from splatseg.pose._pairs import chosen_pairs, connected_groups, likeness
+from splatseg.pose._pairs import connected_groups, likeness, selected_pairs
 from splatseg.pose._photographs import Photograph, read_reduced
 
 PairGraph = Literal["auto", "complete", "window", "reference", "retrieval"]
 """Which photographs are paired."""
 
-Alignment = Literal["robust", "published"]
 """How pairs become one world."""
 
 # Photographs up to which "auto" asks a network about every pair; else each with so many that look
@@ -42,7 +41,8 @@ _COMPLETE_UP_TO, _NEIGHBOURS = 16, 6
         "neighbours": "each photograph is paired with the 6 that look most like it",
         "symmetric": "a network is asked about each pair in both orders, as DUSt3R does",
         "samples": "cameras are found from 768 pixels of each photograph",
-        "iterations": "alignments end by themselves, after 60 steps or the published 300",
+        "alignment": "DUSt3R's knows no outliers, and was measured to be worse",
+        "iterations": "alignments end by themselves, after 60 steps at most",
         "block": "50 photographs are aligned together",
         "keep": "the cloud is taken from the surest four fifths of the pixels",
     }
@@ -62,13 +62,8 @@ class PointmapOptions:
     longest: Annotated[int, Meta(ge=64)] = 512
     """Longest side of the images that a network gets, pixels."""
 
-    alignment: Alignment = "robust"
-    """robust: pairs that contradict the rest are left out, errors count by depth, and eq. 5 is
-    solved by turns in closed form. published: DUSt3R's, all pairs, by Adam from the spanning tree
-    of the surest pairs."""
-
     refine: bool = True
-    """Of robust: end with all cameras, focal lengths, depths and scales at once, with the points of
+    """End with all cameras, focal lengths, depths and scales at once, with the points of
     each pair in its first camera's frame, and with errors along rays and across them divided by how
     large they are."""
 
@@ -154,7 +149,7 @@ def _graph(
     if kind == "reference":
         return [(0, j) for j in range(1, count)]
     alike = likeness([_descriptors(one) for one in photographs], seed=options.seed)
-    return chosen_pairs(alike, overlap=1, neighbours=_NEIGHBOURS)
+    return selected_pairs(alike, overlap=1, neighbours=_NEIGHBOURS)
 
 
 def _descriptors(photograph: Photograph) -> NDArray[np.uint8]:

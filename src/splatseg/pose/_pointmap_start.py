@@ -279,11 +279,6 @@ def agreement(samples: PairSamples, geometry: PairGeometry) -> Float[Tensor, "pa
     return scores + _CONFIDENCE_SHARE * sure / sure.max().clamp_min(1e-12)
 
 
-def confidence_score(samples: PairSamples) -> Float[Tensor, "pairs"]:
-    """DUSt3R's score of a pair: the mean confidence of one map times that of the other."""
-    return samples.weights.double().exp().mean(dim=2).prod(dim=1)
-
-
 def spanning_tree(samples: PairSamples, score: Float[Tensor, "pairs"]) -> list[int]:
     """Pairs of the tree with the highest scores, each reaching one photograph more (Prim).
 

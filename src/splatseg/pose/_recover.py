@@ -210,7 +210,7 @@ def recover_poses(
     tell = teller(progress)
     if folder is None and is_video(source):
         raise InputError("folder: expected a folder for the frames of the video, got None.")
-    with given_or_temporary(folder) as kept:
+    with requested_or_temporary(folder) as kept:
         if is_video(source):
             root, files = kept, _frames(source, kept, options, tell)
         else:
@@ -231,7 +231,7 @@ def recover_poses(
 
 
 @contextmanager
-def given_or_temporary(folder: Path | str | None) -> Generator[Path]:
+def requested_or_temporary(folder: Path | str | None) -> Generator[Path]:
     """The folder, removed again if it is left empty; for None one that is deleted afterwards."""
     if folder is None:
         with tempfile.TemporaryDirectory(prefix="splatseg-") as temporary:

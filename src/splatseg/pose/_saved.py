@@ -22,7 +22,7 @@ from splatseg.io.atomic import atomic_file, named_write_failures
 from splatseg.io.captures.build import build_capture
 from splatseg.io.captures.colmap_model import intrinsics_of, poses_of, read_colmap_model
 from splatseg.io.captures.raw_views import Intrinsics, RawView
-from splatseg.io.foreign import made_from
+from splatseg.io.foreign import derived_from
 from splatseg.io.json_files import parse_object, read_json, write_json
 from splatseg.io.schema import structured
 from splatseg.pose._photographs import LeftOut, Photograph, PoseOptions
@@ -346,7 +346,7 @@ def load_world(folder: Path, *, made_of: str | None = None) -> SavedWorld | None
                 f"{path}: expected {name} as {kind} of {shape}, got {array.dtype} of {array.shape}."
             )
     report = structured(header.get("report"), PointmapReport, where=f"{path}: report")
-    with made_from(path):
+    with derived_from(path):
         cloud = PointCloud(
             points=torch.from_numpy(arrays["points"]), colours=torch.from_numpy(arrays["colours"])
         )
@@ -373,12 +373,9 @@ def capture_of_world(world: SavedWorld, photographs: Sequence[Photograph], root:
             image=one.path,
             relative=one.path.relative_to(root).as_posix(),
             intrinsics=Intrinsics(
-                fx=focal,
-                fy=focal,
-                cx=one.width / 2,
-                cy=one.height / 2,
-                width=one.width,
-                height=one.height,
+                focal=(focal, focal),
+                centre=(one.width / 2, one.height / 2),
+                size=(one.width, one.height),
             ),
             cam_from_world=pose.numpy(),
         )

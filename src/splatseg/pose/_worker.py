@@ -27,10 +27,10 @@ import pycolmap
 
 from splatseg.pose._pairs import (
     all_pairs,
-    chosen_pairs,
     connected_groups,
     likeness,
     linking_pairs,
+    selected_pairs,
 )
 
 # Features of a photograph, those of the largest scales.
@@ -195,7 +195,7 @@ class WorkerJob:
     def _match_likely(self, count: int) -> None:
         """Pairs by name and by looks, and then what may join parts that do not hang together."""
         alike = likeness(self._descriptors(), seed=self._options["seed"])
-        self._match_pairs(chosen_pairs(alike, overlap=_OVERLAP, neighbours=_NEIGHBOURS))
+        self._match_pairs(selected_pairs(alike, overlap=_OVERLAP, neighbours=_NEIGHBOURS))
         groups = connected_groups(count, list(self._verified()))
         if len(set(groups)) > 1:
             self._match_pairs(linking_pairs(alike, groups, neighbours=_NEIGHBOURS))

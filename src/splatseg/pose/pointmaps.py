@@ -15,7 +15,7 @@ from splatseg.core.models import PointmapModel
 from splatseg.errors import InputError
 from splatseg.io.pointmaps import RecordedPointmaps
 from splatseg.pose._photographs import Photograph, find_photographs, read_headers, read_reduced
-from splatseg.pose._pointmap_align import Aligned, align, align_by_gradients, initial
+from splatseg.pose._pointmap_align import Aligned, align, initial
 from splatseg.pose._pointmap_pixels import (
     MIN_WEIGHT,
     PairSamples,
@@ -37,14 +37,13 @@ from splatseg.pose._pointmap_refine import refine
 from splatseg.pose._pointmap_start import (
     agreement,
     average,
-    confidence_score,
     lens_focals,
     pair_geometry,
     ray_directions,
     spanning_tree,
     tree_world,
 )
-from splatseg.pose._recover import PoseProgress, given_or_temporary, teller
+from splatseg.pose._recover import PoseProgress, requested_or_temporary, teller
 from splatseg.pose._saved import (
     ANSWERS,
     SavedWorld,
@@ -59,7 +58,6 @@ from splatseg.pose._saved import PointmapReport as PointmapReport
 
 
 _ROBUST_ITERATIONS = 60
-_PUBLISHED_ITERATIONS = 300
 
 _SAMPLES = 768
 """Pixels of each photograph that cameras are found from."""
@@ -71,6 +69,7 @@ _KEPT_SHARE = 0.8
 _CONSTANTS = {
     "complete_up_to": 16,
     "neighbours": 6,
+    "alignment": "robust",
     "symmetric": True,
     "samples": 768,
     "iterations": None,
@@ -85,29 +84,15 @@ def solve(
     """Cameras, depths and pairs in one world."""
     focal = lens_focals(samples)
     geometry = pair_geometry(samples, focal)
-    published = options.alignment == "published"
-    score = confidence_score(samples) if published else agreement(samples, geometry)
-    world = tree_world(samples, geometry, spanning_tree(samples, score))
-    if published:
-        start = initial(samples, geometry, world, focal)
-        return align_by_gradients(
-            samples,
-            start,
-            iterations=_PUBLISHED_ITERATIONS,
-            progress=progress,
-        )
-    start = initial(samples, geometry, average(samples, geometry, world), focal)
+    tree = spanning_tree(samples, agreement(samples, geometry))
+    world = average(samples, geometry, tree_world(samples, geometry, tree))
+    start = initial(samples, geometry, world, focal)
     stages = 2 if options.refine else 1
 
     def percent(stage: int) -> Callable[[int, int], None]:
         return lambda done, total: progress(100 * stage + 100 * done // total, 100 * stages)
 
-    aligned = align(
-        samples,
-        start,
-        iterations=_ROBUST_ITERATIONS,
-        progress=percent(0),
-    )
+    aligned = align(samples, start, iterations=_ROBUST_ITERATIONS, progress=percent(0))
     if not options.refine:
         return aligned
     return refine(samples, aligned, progress=percent(1))
@@ -172,7 +157,7 @@ def recover_from_pointmaps(
         raise InputError(f"{bad[0].name}: expected photographs that can be read, got {bad[0].why}.")
     asked = _CONSTANTS | asdict(options) | {"source": source_digest(source)}
     made_of = content_digest(files, asked)
-    with given_or_temporary(folder) as kept:
+    with requested_or_temporary(folder) as kept:
         world = load_world(kept, made_of=made_of)
         reused = world is not None
         if world is None:

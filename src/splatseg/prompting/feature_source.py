@@ -14,12 +14,10 @@ finds in the view cover 90 % of the mask, centres of k-means over them otherwise
 What is similar, and the threshold, by `FeatureMembershipOptions.rule`: *fixed* compares by cosine
 with one number, SAM-based prompts too. *adaptive* is the paper's: cosines with the mean of all
 scores as the threshold; of SAM-based prompts products (eq. 12), with the mean and one standard
-deviation. *code* compares as adaptive does, with the published code's threshold
-(`retrieval.published_threshold`).
+deviation.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
@@ -38,13 +36,12 @@ from splatseg.prompting.retrieval import (
     StoredFeatures,
     deviation_threshold,
     mean_threshold,
-    published_threshold,
     scores,
 )
-from splatseg.prompting.seen import SeenPrompt
+from splatseg.prompting.seen import VisiblePrompt
 from splatseg.render import SparseWeights
 
-ThresholdRule = Literal["fixed", "adaptive", "code"]
+ThresholdRule = Literal["fixed", "adaptive"]
 _CLUSTERS = 5
 """Queries that strokes and masks are reduced to by k-means, as published."""
 
@@ -63,7 +60,7 @@ class FeatureMembershipOptions:
 
     rule: ThresholdRule = "fixed"
     """What a score must exceed. fixed: `threshold`. adaptive: the mean of the scores, of SAM-based
-    prompts mean and one standard deviation, as in the paper. code: as in its published code."""
+    prompts mean and one standard deviation, as in the paper."""
 
     threshold: Annotated[float, Meta(ge=-1, le=1)] = 0.85
     """Similarity in [-1, 1] of the fixed rule. The published code has 0.75;
@@ -115,7 +112,7 @@ class FeatureMembership:
 
     @boundary
     def membership(
-        self, prompts: Sequence[SeenPrompt], *, granularity: float | None = None
+        self, prompts: Sequence[VisiblePrompt], *, granularity: float | None = None
     ) -> Float[Tensor, "n"]:
         """How likely each Gaussian belongs to what is shown, see `MembershipSource`.
 
@@ -126,55 +123,42 @@ class FeatureMembership:
         if not queries:
             raise InputError("features: expected features where the prompts are, got none.")
         gate = self._gate(granularity)
-        confidence = torch.stack([self._confidence(one, gate) for one in queries]).amax(dim=0)
+        found = [self._confidence(similarity, some, gate) for similarity, some in queries.items()]
+        confidence = torch.stack(found).amax(dim=0)
         negative = torch.cat([self._values[:0], *map(self._negative, prompts)])
         if len(negative):
             # Equally like what is meant and what is not is the border as well.
-            positive = torch.cat([one.queries for one in queries])
+            positive = torch.cat(list(queries.values()))
             found = scores(self._stored("cosine"), positive, gate=gate)
             against = scores(self._stored("cosine"), negative, gate=gate)
             confidence = torch.minimum(confidence, (0.5 + (found - against)).clamp(0, 1))
         return confidence if self._seen is None else confidence.where(self._seen, 0.0)
 
-    def _queries(self, prompts: Sequence[SeenPrompt]) -> list["_Queries"]:
+    def _queries(self, prompts: Sequence[VisiblePrompt]) -> dict[Similarity, Float[Tensor, "q d"]]:
         """Positive queries of all prompts, those of one similarity together."""
-        found: dict[Similarity, list[_Queries]] = {"cosine": [], "dot": []}
+        found: dict[Similarity, list[Tensor]] = {"cosine": [], "dot": []}
         for prompt in prompts:
-            shown = self._shown(prompt.positive_rows)
             queries = None
             if prompt.dense and prompt.inside is not None and not prompt.guessed:
                 queries = self._mask_queries(prompt)
             by_product = queries is not None and self._options.rule != "fixed"
             if queries is None:
-                queries = self._thinned(prompt, shown)
-            similarity: Similarity = "dot" if by_product else "cosine"
+                queries = self._thinned(prompt, self._shown(prompt.positive_rows))
             if len(queries):
-                inside = shown if prompt.dense else shown[:0]
-                found[similarity].append(_Queries(similarity, queries, inside))
-        return [_Queries.together(some) for some in found.values() if some]
+                found["dot" if by_product else "cosine"].append(queries)
+        return {similarity: torch.cat(some) for similarity, some in found.items() if some}
 
-    def _confidence(self, query: "_Queries", gate: Tensor | None) -> Float[Tensor, "n"]:
+    def _confidence(
+        self, similarity: Similarity, queries: Float[Tensor, "q d"], gate: Tensor | None
+    ) -> Float[Tensor, "n"]:
         """In [0, 1], 0.5 at the threshold of the rule."""
-        found = scores(self._stored(query.similarity), query.queries, gate=gate)
-        if query.similarity == "cosine":
-            return _around(found, self._limit(found, query, gate), low=-1.0, high=1.0)
-        ends = float(found.min()), float(found.max())
-        return _around(found, self._limit(found, query, gate), low=ends[0], high=ends[1])
-
-    def _limit(self, found: Tensor, query: "_Queries", gate: Tensor | None) -> float:
-        match self._options.rule:
-            case "fixed":
-                return self._options.threshold
-            case "adaptive":
-                by_product = query.similarity == "dot"
-                return deviation_threshold(found) if by_product else mean_threshold(found)
-            case "code":
-                if not len(query.inside):
-                    return published_threshold(found, found[:0])
-                inside = StoredFeatures.of(
-                    query.inside, precision="float32", similarity=query.similarity
-                )
-                return published_threshold(found, scores(inside, query.queries, gate=gate))
+        found = scores(self._stored(similarity), queries, gate=gate)
+        by_cosine = similarity == "cosine"
+        limit = self._options.threshold
+        if self._options.rule == "adaptive":
+            limit = mean_threshold(found) if by_cosine else deviation_threshold(found)
+        low, high = (-1.0, 1.0) if by_cosine else (float(found.min()), float(found.max()))
+        return _around(found, limit, low=low, high=high)
 
     def _stored(self, similarity: Similarity) -> StoredFeatures:
         """The features as they are compared, made when they are first asked for."""
@@ -188,11 +172,11 @@ class FeatureMembership:
             return None
         return head.gate(head.scale(_OBJECT if granularity is None else granularity))
 
-    def _negative(self, prompt: SeenPrompt) -> Float[Tensor, "q d"]:
+    def _negative(self, prompt: VisiblePrompt) -> Float[Tensor, "q d"]:
         """Queries of what is not meant."""
         return self._thinned(prompt, self._shown(prompt.negative_rows))
 
-    def _thinned(self, prompt: SeenPrompt, shown: Float[Tensor, "p d"]) -> Float[Tensor, "q d"]:
+    def _thinned(self, prompt: VisiblePrompt, shown: Float[Tensor, "p d"]) -> Float[Tensor, "q d"]:
         """What pixels show, of strokes, masks and boxes the centres of k-means."""
         many = prompt.dense and len(shown) > _CLUSTERS
         return self._centres(shown) if many else shown
@@ -202,7 +186,7 @@ class FeatureMembership:
         shown = rows.to("cpu").product(self._values)
         return shown[torch.linalg.vector_norm(shown, dim=1) > 0]
 
-    def _mask_queries(self, prompt: SeenPrompt) -> Float[Tensor, "q d"] | None:
+    def _mask_queries(self, prompt: VisiblePrompt) -> Float[Tensor, "q d"] | None:
         """Queries of a mask by 2D features; None where there are none."""
         head = self._head
         if head is None or not head.projector or self._guidance is None or prompt.inside is None:
@@ -227,25 +211,6 @@ class FeatureMembership:
         made = KMeans(n_clusters=count, random_state=self._options.seed)
         made.fit(values.double().numpy())
         return torch.from_numpy(made.cluster_centers_).float()
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Queries:
-    """Queries that scores are made with in one way."""
-
-    similarity: Similarity
-    queries: Float[Tensor, "q d"]
-    inside: Float[Tensor, "p d"]
-    """What pixels of masks and strokes show; a point alone would be as alike as can be."""
-
-    @classmethod
-    def together(cls, some: Sequence["_Queries"]) -> "_Queries":
-        """Those of several prompts."""
-        return cls(
-            some[0].similarity,
-            torch.cat([one.queries for one in some]),
-            torch.cat([one.inside for one in some]),
-        )
 
 
 def _around(found: Tensor, limit: float, *, low: float, high: float) -> Tensor:

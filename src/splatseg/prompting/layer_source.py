@@ -28,7 +28,7 @@ from splatseg.core import UNLABELLED, Gaussians, InstanceTree, Labels, Layer, Se
 from splatseg.core.boundary import boundary
 from splatseg.core.instance_tree import layer_kind
 from splatseg.errors import InputError, ShapeError
-from splatseg.prompting.seen import SeenPrompt, ViewCache
+from splatseg.prompting.seen import ViewCache, VisiblePrompt
 from splatseg.prompting.tree_choice import RegionCounts, TreeChoice, best_ids, region_counts
 from splatseg.render import SparseWeights
 
@@ -39,7 +39,7 @@ _SHARED = 0.2
 """Share of what other clicks mean around a click from which on it is at their border."""
 
 
-def pixels_around(
+def neighbouring_pixels(
     pixel: Int64[Tensor, "2"], height: int, width: int
 ) -> tuple[Int64[Tensor, "p 2"], Tensor]:
     """Pixels of a picture around one, column and row, and how much each has to say."""
@@ -169,7 +169,7 @@ class LayerSource:
 
     @boundary
     def membership(
-        self, prompts: Sequence[SeenPrompt], *, granularity: float | None = None
+        self, prompts: Sequence[VisiblePrompt], *, granularity: float | None = None
     ) -> Float[Tensor, "n"]:
         """How likely each Gaussian belongs to what is shown, see `MembershipSource`.
 
@@ -238,7 +238,7 @@ class LayerSource:
         return self._of_ids(alike)
 
     def _clicked(
-        self, prompts: Sequence[SeenPrompt], granularity: float | None, hidden: set[int]
+        self, prompts: Sequence[VisiblePrompt], granularity: float | None, hidden: set[int]
     ) -> list[int]:
         """Ids that positive points mean, -1 not among them.
 
@@ -251,7 +251,7 @@ class LayerSource:
         for one in prompts:
             for pixel in () if one.dense else one.pixels[one.positive].cpu():
                 camera = one.view.camera
-                pixels, votes = pixels_around(pixel, camera.height, camera.width)
+                pixels, votes = neighbouring_pixels(pixel, camera.height, camera.width)
                 ids = shown_ids(self._labels, self._views.prepared(one.view).weights(pixels))
                 own = (pixels == pixel).all(dim=1)
                 said = own | torch.tensor([id not in hidden for id in ids.tolist()])
@@ -271,7 +271,7 @@ class LayerSource:
             return id
         return self._choice.node_at(id, granularity)
 
-    def _shown(self, prompts: Sequence[SeenPrompt], *, positive: bool) -> list[int]:
+    def _shown(self, prompts: Sequence[VisiblePrompt], *, positive: bool) -> list[int]:
         """Ids right at points and under strokes of one sign, each once; -1 is not among them."""
         found: dict[int, None] = {}
         for one in prompts:
@@ -285,7 +285,7 @@ class LayerSource:
             found |= dict.fromkeys(values.tolist())
         return list(found)
 
-    def _regions(self, prompts: Sequence[SeenPrompt]) -> list[RegionCounts]:
+    def _regions(self, prompts: Sequence[VisiblePrompt]) -> list[RegionCounts]:
         """How the layer lies in the masks and boxes that say by themselves where the thing is."""
         return [
             region_counts(self._labels, self._views, one.view, one.inside, boxed=one.guessed)

@@ -46,7 +46,7 @@ from splatseg.prompting.graph import (
     specks,
 )
 from splatseg.prompting.next_click import NextClick
-from splatseg.prompting.seen import SeenPrompt, ViewCache
+from splatseg.prompting.seen import ViewCache, VisiblePrompt
 
 MAX_NEIGHBOURS = 32
 """Most neighbours that a mean distance of the filter is of; published is no limit."""
@@ -82,7 +82,7 @@ class MembershipSource(Protocol):
     """Knows which Gaussians belong together: from masks, features or a layer."""
 
     def membership(
-        self, prompts: Sequence[SeenPrompt], *, granularity: float | None
+        self, prompts: Sequence[VisiblePrompt], *, granularity: float | None
     ) -> Float[Tensor, "n"]:
         """How likely each Gaussian belongs to what the prompts show.
 
@@ -150,7 +150,7 @@ class SelectionContext:
     gaussians: Gaussians
     """Of the scene."""
 
-    prompts: tuple[SeenPrompt, ...]
+    prompts: tuple[VisiblePrompt, ...]
     """What was shown."""
 
     views: ViewCache

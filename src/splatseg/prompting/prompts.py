@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from splatseg._check import check_finite, check_shape
+from splatseg._check import check_finite
 from splatseg.core import Gaussians, Selection, View
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.models import signs_of_points
@@ -86,7 +86,6 @@ class ViewPrompt:
     def _check_box(self) -> None:
         if self.box is None:
             return
-        check_shape("box", self.box, (4,))
         check_finite("box", self.box)
         x0, y0, x1, y1 = self.box.tolist()
         width, height = self.view.camera.width, self.view.camera.height
@@ -183,7 +182,6 @@ class Lasso:
 
     def __post_init__(self) -> None:
         convert_fields(self)
-        check_shape("polygon", self.polygon, (None, 2))
         check_finite("polygon", self.polygon)
         if len(self.polygon) < _CORNERS:
             raise ShapeError(

@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float, Float32
 from torch import Tensor
 
-from splatseg._check import check_choice, check_finite, check_shape
+from splatseg._check import check_finite, check_shape
 from splatseg._native import match_features
 from splatseg.core.boundary import boundary
 from splatseg.errors import RangeError, ShapeError
@@ -31,8 +31,6 @@ MAX_CHANNELS = 1024
 _DTYPES = {"float32": torch.float32, "float16": torch.float16, "int8": torch.int8}
 _HALF_MAX = 65504.0
 _INT8_MAX = 127.0
-_TOP = 0.1
-"""Share of the Gaussians that the published code retrieves at most."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,8 +79,6 @@ class StoredFeatures:
             raise ShapeError(
                 f"values: expected shape (any, 1 to {MAX_CHANNELS}), got {tuple(values.shape)}."
             )
-        check_choice("precision", precision, _DTYPES)
-        check_choice("similarity", similarity, ("cosine", "dot"))
         check_finite("values", values)
         table = values.detach().cpu().float()
         if similarity == "cosine":
@@ -167,20 +163,6 @@ def deviation_threshold(positive: Float[Tensor, "n"]) -> float:
         return 0.0
     wide = positive.double()
     return float(wide.mean() + wide.std(correction=0))
-
-
-def published_threshold(positive: Float[Tensor, "n"], in_mask: Float[Tensor, "p"]) -> float:
-    """The threshold of the published code: the largest of three.
-
-    Mean and standard deviation of the scores of the rendered features of the pixels in the
-    prompt's mask, the score that the best tenth of the Gaussians are above, and 0.
-    """
-    highest = deviation_threshold(in_mask) if len(in_mask) else 0.0
-    highest = max(0.0, highest)
-    kept = int(_TOP * len(positive))
-    if len(positive) and kept < len(positive):
-        highest = max(highest, float(positive.kthvalue(len(positive) - kept).values))
-    return highest
 
 
 def _folded(

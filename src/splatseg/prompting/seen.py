@@ -101,7 +101,7 @@ class ViewCache:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class SeenPrompt:
+class VisiblePrompt:
     """What a prompt shows in its view: pixels, and the Gaussians seen in them."""
 
     view: View
@@ -135,7 +135,6 @@ class SeenPrompt:
         convert_fields(self)
         count = len(self.rows)
         check_shape("pixels", self.pixels, (count, 2))
-        check_shape("positive", self.positive, (count,))
         if self.inside is not None:
             check_shape("inside", self.inside, (self.view.camera.height, self.view.camera.width))
 
@@ -163,7 +162,7 @@ def see_prompts(
     seed: int = 0,
     views: ViewCache | None = None,
     backend: str = "auto",
-) -> tuple[SeenPrompt, ...]:
+) -> tuple[VisiblePrompt, ...]:
     """The Gaussians that prompts show.
 
     Points keep one row each. Masks and strokes are thinned to `max_pixels` pixels, one at random
@@ -188,7 +187,7 @@ def see_prompts(
     if not prompts:
         raise InputError("prompts: expected at least one, got none.")
     cache = ViewCache(gaussians, backend=backend, capacity=1) if views is None else views
-    seen: list[SeenPrompt] = []
+    seen: list[VisiblePrompt] = []
     try:
         for prompt in prompts:
             inside = _inside(prompt)
@@ -252,7 +251,7 @@ def _central(box: Float[Tensor, "4"], view: View) -> Tensor:
     return central if bool(central.any()) else within
 
 
-def _seen_points(cache: ViewCache, prompt: ViewPrompt, inside: Tensor | None) -> SeenPrompt:
+def _seen_points(cache: ViewCache, prompt: ViewPrompt, inside: Tensor | None) -> VisiblePrompt:
     pixels = prompt.points.floor().long()
     rows = cache.prepared(prompt.view).weights(pixels)
     dark = rows.row_sums() < _MIN_ALPHA
@@ -262,7 +261,7 @@ def _seen_points(cache: ViewCache, prompt: ViewPrompt, inside: Tensor | None) ->
             f"points: expected one on something, got ({x:g}, {y:g}) in view {prompt.view.name}, "
             "where no Gaussian stops the light (the sky)."
         )
-    return SeenPrompt(
+    return VisiblePrompt(
         view=prompt.view,
         rows=rows,
         pixels=pixels,
@@ -280,7 +279,7 @@ def _seen_region(
     *,
     max_pixels: int,
     generator: torch.Generator,
-) -> SeenPrompt:
+) -> VisiblePrompt:
     prepared = cache.prepared(prompt.view)
     parts: list[tuple[SparseWeights, Tensor, bool]] = []
     for name, region, positive in shown:
@@ -293,7 +292,7 @@ def _seen_region(
                 "a Gaussian stops the light (the sky)."
             )
         parts.append((rows.select(lit), pixels[lit.to(pixels.device)], positive))
-    return SeenPrompt(
+    return VisiblePrompt(
         view=prompt.view,
         rows=SparseWeights.concatenate([rows for rows, _, _ in parts]),
         pixels=torch.cat([pixels for _, pixels, _ in parts]),
@@ -333,7 +332,7 @@ def _first_of_each(cells: Int64[Tensor, "p"], order: Int64[Tensor, "p"]) -> Int6
     return by_cell[first].sort().values
 
 
-def _check_contradictions(seen: Sequence[SeenPrompt]) -> None:
+def _check_contradictions(seen: Sequence[VisiblePrompt]) -> None:
     """Refuse prompts that no set of Gaussians can satisfy.
 
     Points are held against each other in pairs; masks and strokes as a whole, because where they
@@ -346,7 +345,7 @@ def _check_contradictions(seen: Sequence[SeenPrompt]) -> None:
     _check_regions([one for one in seen if one.dense])
 
 
-def _check_points(points: Sequence[SeenPrompt]) -> None:
+def _check_points(points: Sequence[VisiblePrompt]) -> None:
     """Each negative point against each positive one, whatever views they are in."""
     if not points:
         return
@@ -367,7 +366,7 @@ def _check_points(points: Sequence[SeenPrompt]) -> None:
             )
 
 
-def _check_regions(seen: Sequence[SeenPrompt]) -> None:
+def _check_regions(seen: Sequence[VisiblePrompt]) -> None:
     """The mean row of all positive pixels against that of all negative ones."""
     if not seen:
         return

@@ -5,9 +5,6 @@ from splatseg.render._backend import BackendName as BackendName
 from splatseg.render._backend import default_options as default_options
 from splatseg.render._backend import get_backend as get_backend
 from splatseg.render._backend import options_for as options_for
-from splatseg.render._products import ImageWeights as ImageWeights
-from splatseg.render._products import PartSums as PartSums
-from splatseg.render._products import ViewWeights as ViewWeights
 from splatseg.render._rows import CompactRows as CompactRows
 from splatseg.render._rows import SparseWeights as SparseWeights
 from splatseg.render._values import BackProjected as BackProjected
@@ -21,7 +18,6 @@ from splatseg.render._values import StrongestChannels as StrongestChannels
 from splatseg.render.prepared import PreparedView as PreparedView
 from splatseg.render.prepared import back_project as back_project
 from splatseg.render.prepared import contributors as contributors
-from splatseg.render.prepared import image_weights as image_weights
 from splatseg.render.prepared import prepare as prepare
 from splatseg.render.prepared import render as render
 from splatseg.render.prepared import weights as weights

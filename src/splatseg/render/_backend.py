@@ -9,12 +9,14 @@ and `weights` keeps W.
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from functools import cache
-from typing import ClassVar, Literal, Self, cast, get_args
+from typing import Any, ClassVar, Literal, Self, cast, get_args
 from weakref import WeakKeyDictionary
 
+import numpy as np
 import torch
-from jaxtyping import Float, Int, Int64
+from jaxtyping import Float, Int, Int32, Int64
 from torch import Tensor
 
 from splatseg._check import check_choice, check_finite, check_shape
@@ -22,7 +24,6 @@ from splatseg.core import Camera, Gaussians
 from splatseg.core.boundary import boundary
 from splatseg.core.gaussians import LOW_PASS
 from splatseg.errors import InputError, RangeError
-from splatseg.render._products import ImageWeights
 from splatseg.render._rows import SparseWeights
 from splatseg.render._values import (
     BackProjected,
@@ -84,14 +85,26 @@ class BackendView(ABC):
     def rows(self, pixels: Int[Tensor, "p 2"] | None, k: int | None) -> SparseWeights:
         """Rows of W: all pixels or some, all entries or each pixel's k strongest."""
 
-    @abstractmethod
-    def blocks(self) -> ImageWeights:
-        """W in blocks of 4 x 4 pixels."""
-
     @property
     @abstractmethod
     def size(self) -> tuple[int, int]:
         """Height and width."""
+
+    def part_sums(self, parts: Sequence[Int32[Tensor, "pixels"]]) -> list[Any]:
+        """Rows of W summed over the parts of each partition: sparse (parts, Gaussians)."""
+        from scipy import sparse
+
+        rows = self.rows(None, None).to_scipy().astype(np.float64)
+        found: list[Any] = []
+        for part in parts:
+            inside = np.flatnonzero(part.numpy() >= 0)
+            places = (part.numpy()[inside], inside)
+            shape = (max(0, int(part.max()) + 1), len(part))
+            members = sparse.csr_matrix((np.ones(len(inside)), places), shape=shape)
+            sums: Any = members @ rows
+            sums.sort_indices()
+            found.append(sums)
+        return found
 
     def back_project_sparse(self, image: SparseImage) -> SparseBackProjected:
         """``W.T @ image`` and ``W.T @ 1`` of an image of many channels. On the CPU."""

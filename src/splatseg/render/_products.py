@@ -1,78 +1,20 @@
-"""W of a view, kept for reuse, and products with compressed sparse rows.
+"""Products with compressed sparse rows.
 
 Products are differentiable and the same for any number of threads. On the CPU with float32 values
 they are native kernels; anywhere else they are torch's `embedding_bag`, which sums a row's entries
 in their order and stores no product.
 """
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float64, Int32, Int64
+from jaxtyping import Bool, Float, Int32, Int64
 from torch import Tensor
 
 from splatseg import _native
-
-
-class ViewWeights(ABC):
-    """W of one view, kept for reuse: half-precision weights, float32 products.
-
-    Both products are differentiable in torch with respect to what they are given.
-    """
-
-    __slots__ = ()
-
-    @property
-    @abstractmethod
-    def shape(self) -> tuple[int, int]:
-        """Pixels and Gaussians."""
-
-    @property
-    @abstractmethod
-    def nbytes(self) -> int:
-        """Memory it holds."""
-
-    @abstractmethod
-    def product(self, signal: Float[Tensor, "n channels"]) -> Float[Tensor, "pixels channels"]:
-        """``W @ signal``, row by row of the image (or of the pixels asked for)."""
-
-    @abstractmethod
-    def adjoint(self, image: Float[Tensor, "pixels channels"]) -> Float[Tensor, "n channels"]:
-        """``W.T @ image``."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PartSums:
-    """Rows of W summed over parts of an image, as compressed sparse rows."""
-
-    indptr: Int64[Tensor, "parts_plus_1"]
-    """Where the entries of each part begin."""
-
-    ids: Int32[Tensor, "entries"]
-    """Gaussians, ascending in each part."""
-
-    sums: Float64[Tensor, "entries"]
-    """Their weights summed over the pixels of the part, above 0."""
-
-
-class ImageWeights(ViewWeights):
-    """W of a whole image, in blocks of 4 x 4 pixels."""
-
-    __slots__ = ()
-
-    @abstractmethod
-    def part_sums(self, part: Int32[Tensor, "pixels"]) -> PartSums:
-        """Sum W over each part of the image.
-
-        Weights are half precision and sums double: they are exact.
-
-        Args:
-            part: The part of each pixel, row by row, from 0; negative where it is in none.
-        """
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -114,6 +56,22 @@ class Csr:
     ids: Int32[Tensor, "entries"]
     weights: Float[Tensor, "entries"]
     columns: int
+
+    @property
+    def nbytes(self) -> int:
+        """Memory they hold."""
+        return self.indptr.nbytes + self.ids.nbytes + self.weights.nbytes
+
+    def to(
+        self, device: torch.device | str | None = None, *, dtype: torch.dtype | None = None
+    ) -> "Csr":
+        """The same arrays elsewhere, or with weights of another precision."""
+        return replace(
+            self,
+            indptr=self.indptr.to(device=device),
+            ids=self.ids.to(device=device),
+            weights=self.weights.to(device=device, dtype=dtype),
+        )
 
     def product(self, values: Float[Tensor, "columns c"]) -> Float[Tensor, "rows c"]:
         """``W @ values``."""

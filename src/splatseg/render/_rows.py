@@ -11,12 +11,12 @@ from torch import Tensor
 from splatseg._check import check_finite, check_shape
 from splatseg.core.boundary import convert_fields
 from splatseg.errors import InputError, RangeError
-from splatseg.render._products import Csr, LinearMap, ViewWeights, on_cpu, starts_of, strong_entries
+from splatseg.render._products import Csr, LinearMap, on_cpu, starts_of, strong_entries
 
 
 @final
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class SparseWeights(ViewWeights):
+class SparseWeights:
     """W, or some of its rows, as compressed sparse rows on any device.
 
     The Gaussians and weights of row p are ``ids[indptr[p]:indptr[p + 1]]`` and ``weights[...]``,
@@ -102,7 +102,7 @@ class SparseWeights(ViewWeights):
     @property
     def nbytes(self) -> int:
         """Memory it holds."""
-        return self.indptr.nbytes + self.ids.nbytes + self.weights.nbytes
+        return self._csr.nbytes
 
     @property
     def device(self) -> torch.device:
@@ -116,12 +116,7 @@ class SparseWeights(ViewWeights):
         dtype: torch.dtype | None = None,
     ) -> "SparseWeights":
         """The same rows elsewhere, or with weights of another precision."""
-        return replace(
-            self,
-            indptr=self.indptr.to(device=device),
-            ids=self.ids.to(device=device),
-            weights=self.weights.to(device=device, dtype=dtype),
-        )
+        return self._of(self._csr.to(device, dtype=dtype))
 
     def to_scipy(self) -> Any:
         """A ``scipy.sparse.csr_matrix`` (rows, Gaussians) of float32 weights."""
@@ -299,14 +294,7 @@ class CompactRows:
     @property
     def nbytes(self) -> int:
         """Memory it holds."""
-        columns = self._columns
-        return (
-            self.touched.nbytes
-            + self.rows.nbytes
-            + columns.indptr.nbytes
-            + columns.ids.nbytes
-            + columns.weights.nbytes
-        )
+        return self.touched.nbytes + self.rows.nbytes + self._columns.nbytes
 
     def to(
         self,
@@ -315,16 +303,10 @@ class CompactRows:
         dtype: torch.dtype | None = None,
     ) -> "CompactRows":
         """The same rows elsewhere, or with weights of another precision."""
-        columns = self._columns
         return CompactRows(
             touched=self.touched.to(device=device),
             rows=self.rows.to(device, dtype=dtype),
-            _columns=replace(
-                columns,
-                indptr=columns.indptr.to(device=device),
-                ids=columns.ids.to(device=device),
-                weights=columns.weights.to(device=device, dtype=dtype),
-            ),
+            _columns=self._columns.to(device, dtype=dtype),
         )
 
     def product(self, signal: Float[Tensor, "touched c"]) -> Float[Tensor, "rows c"]:

@@ -3,7 +3,7 @@
 Results do not depend on the number of threads.
 """
 
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
 from typing import Any, ClassVar, cast
 
 import numpy as np
@@ -12,11 +12,10 @@ from jaxtyping import Float, Int, Int32
 from torch import Tensor
 
 from splatseg import _native
-from splatseg._check import check_choice, check_shape
+from splatseg._check import check_choice
 from splatseg.core import Camera, Gaussians
 from splatseg.errors import BackendError, InputError, RangeError
 from splatseg.render._backend import Backend, BackendView, needs_graph
-from splatseg.render._products import ImageWeights, LinearMap, PartSums
 from splatseg.render._rows import SparseWeights
 from splatseg.render._values import (
     BackProjected,
@@ -36,23 +35,6 @@ _LANES = 16
 _free_views: list[_native.View] = []
 _FREE_VIEWS = 4
 _INPUTS = ("means", "rotations", "scales", "opacities", "sh", "signal", "pose", "screen_offsets")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class SceneGradients:
-    """Gradients of one backward pass; rows of Gaussians that the view does not show are 0."""
-
-    means: Float[Tensor, "n 3"] | None
-    rotations: Float[Tensor, "n 4"] | None
-    scales: Float[Tensor, "n 3"] | None
-    opacities: Float[Tensor, "n"] | None
-    sh: Float[Tensor, "n coefficients 3"] | None
-    signal: Float[Tensor, "n channels"] | None
-    screen_offsets: Float[Tensor, "n 2"] | None
-    """With respect to the projected centres, per pixel, for densification."""
-
-    pose: Float[Tensor, "4 4"] | None
-    """Of ``cam_from_world``."""
 
 
 class CpuBackend(Backend):
@@ -221,12 +203,10 @@ class CpuView(BackendView):
             indptr=indptr, ids=ids, weights=weights.to(torch.float16), gaussians=count
         )
 
-    def blocks(self) -> ImageWeights:
-        """W in blocks of 4 x 4 pixels."""
-        height, width = self.size
-        return CpuBlockWeights(
-            self.block_matrix(), gaussians=len(self._gaussians), height=height, width=width
-        )
+    def part_sums(self, parts: Sequence[Int32[Tensor, "pixels"]]) -> list[Any]:
+        """Rows of W summed over the parts of each partition: sparse (parts, Gaussians)."""
+        matrix, count = self.block_matrix(), len(self._gaussians)
+        return [_part_sums(matrix, part, count) for part in parts]
 
     def block_matrix(self) -> _native.BlockMatrix:
         """The kernels' own blocks."""
@@ -294,57 +274,44 @@ class CpuView(BackendView):
     def backward(
         self,
         v_image: Float[Tensor, "height width channels"],
-        *,
-        v_alpha: Float[Tensor, "height width"] | None = None,
-        v_depth_sum: Float[Tensor, "height width"] | None = None,
-        wanted: frozenset[str] = frozenset(
-            ("means", "rotations", "scales", "opacities", "sh", "screen_offsets")
-        ),
-    ) -> SceneGradients:
+        v_alpha: Float[Tensor, "height width"],
+        v_depth_sum: Float[Tensor, "height width"] | None,
+        wanted: Collection[str],
+    ) -> dict[str, Tensor]:
         """Gradients of ``<v_image, image> + <v_alpha, alpha> + <v_depth_sum, depth_sum>``.
 
-        Needs a `draw` with ``record=True`` before it, of which it is the derivative.
+        Needs a `draw` with ``record=True`` before it, of which it is the derivative. Rows of
+        Gaussians that the view does not show are 0.
         """
         if self._forward is None:
             raise RuntimeError("backward: draw(record=True) comes first.")
-        image, alpha, depth_sum = self._forward
-        view = self._kernels()
-
-        def maybe(t: Tensor | None) -> Tensor | None:
-            return None if t is None else _plain(t)
-
-        n, channels = len(self._gaussians), image.shape[2]
-        v_signal = _zeros(n, channels) if "signal" in wanted else None
-        planes = (image, alpha, depth_sum, _plain(v_image), maybe(v_alpha), maybe(v_depth_sum))
+        v_depth = None if v_depth_sum is None else _plain(v_depth_sum)
+        planes = (*self._forward, _plain(v_image), _plain(v_alpha), v_depth)
+        view, n, channels = self._kernels(), len(self._gaussians), v_image.shape[2]
+        shapes: dict[str, tuple[int, ...]] = {
+            "means": (n, 3), "rotations": (n, 4), "scales": (n, 3), "opacities": (n,),
+            "screen_offsets": (n, 2), "signal": (n, channels),
+        }  # fmt: skip
+        if self._sh is not None and self._wide is None:
+            shapes["sh"] = tuple(self._sh.shape)
+        found = {name: _zeros(*shape) for name, shape in shapes.items() if name in wanted}
+        signal = found.get("signal")
         if self._wide is None:
             view.backward_colour(channels, *planes)
-            if v_signal is not None:
-                view.narrow_signal_gradient(channels, v_signal)
+            if signal is not None:
+                view.narrow_signal_gradient(channels, signal)
         else:
-            view.backward_features(self._wide, channels, *planes, v_signal)
-
-        def zeros(name: str, *shape: int) -> Tensor | None:
-            return _zeros(n, *shape) if name in wanted else None
-
-        use_sh = "sh" in wanted and self._sh is not None and self._wide is None
-        means, rotations, scales = zeros("means", 3), zeros("rotations", 4), zeros("scales", 3)
-        opacities, screen_offsets = zeros("opacities"), zeros("screen_offsets", 2)
-        sh = _zeros(*self._sh.shape) if use_sh and self._sh is not None else None
+            view.backward_features(self._wide, channels, *planes, signal)
         pose = torch.zeros(15, dtype=torch.float64) if "pose" in wanted else None
-        if any(
-            x is not None for x in (means, rotations, scales, opacities, sh, screen_offsets, pose)
-        ):
-            view.chain(self._cloud, means, rotations, scales, opacities, sh, screen_offsets, pose)
-        return SceneGradients(
-            means=means,
-            rotations=rotations,
-            scales=scales,
-            opacities=opacities,
-            sh=sh,
-            signal=v_signal,
-            screen_offsets=screen_offsets,
-            pose=None if pose is None else self._pose_gradient(pose),
-        )
+        if pose is not None or found.keys() - {"signal"}:
+            own = found.get
+            view.chain(
+                self._cloud, own("means"), own("rotations"), own("scales"), own("opacities"),
+                own("sh"), own("screen_offsets"), pose,
+            )  # fmt: skip
+        if pose is not None:
+            found["pose"] = self._pose_gradient(pose)
+        return found
 
     def _pose_gradient(self, sums: Tensor) -> Tensor:
         """From the rows of [R | t] and the camera centre c = -R^T t, where SH directions begin."""
@@ -377,85 +344,30 @@ class _Render(torch.autograd.Function):
         view = cast(CpuView, ctx.view)
         needs: tuple[bool, ...] = ctx.needs_input_grad
         v_image, v_alpha, v_depth_sum = v_outputs[:3]
-        found = view.backward(
-            v_image,
-            v_alpha=v_alpha,
-            v_depth_sum=v_depth_sum if bool(v_depth_sum.any()) else None,
-            wanted=frozenset(name for name, need in zip(_INPUTS, needs, strict=False) if need),
+        wanted = [name for name, need in zip(_INPUTS, needs, strict=False) if need]
+        v_depth_sum = v_depth_sum if bool(v_depth_sum.any()) else None
+        found = view.backward(v_image, v_alpha, v_depth_sum, wanted)
+        typed = (
+            found[name].to(dtype) if name in found else None
+            for name, dtype in zip(_INPUTS, ctx.dtypes, strict=True)
         )
-        gradients = (getattr(found, name) for name in _INPUTS)
-        typed = [
-            g.to(dtype) if need and g is not None else None
-            for g, dtype, need in zip(gradients, ctx.dtypes, needs, strict=False)
-        ]
         return (*typed, None, None, None)
 
 
-class CpuBlockWeights(ImageWeights):
-    """Blocks of 4 x 4 pixels x Gaussians: an int32 id and 16 half-precision weights each."""
+def _part_sums(matrix: _native.BlockMatrix, part: Int32[Tensor, "pixels"], gaussians: int) -> Any:
+    """Sums of one partition, block by block and then part by part."""
+    from scipy import sparse
 
-    def __init__(
-        self, matrix: _native.BlockMatrix, *, gaussians: int, height: int, width: int
-    ) -> None:
-        self._matrix = matrix
-        self._gaussians, self._height, self._width = gaussians, height, width
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Pixels and Gaussians."""
-        return self._height * self._width, self._gaussians
-
-    @property
-    def nbytes(self) -> int:
-        """Memory it holds."""
-        return self._matrix.nbytes
-
-    def product(self, signal: Float[Tensor, "n channels"]) -> Float[Tensor, "pixels channels"]:
-        """``W @ signal``, row by row of the image."""
-        check_shape("signal", signal, (self._gaussians, None))
-        return LinearMap(forward=self._product, adjoint=self._adjoint)(signal)
-
-    def adjoint(self, image: Float[Tensor, "pixels channels"]) -> Float[Tensor, "n channels"]:
-        """``W.T @ image``."""
-        check_shape("image", image, (self._height * self._width, None))
-        return LinearMap(forward=self._adjoint, adjoint=self._product)(image)
-
-    def _product(self, signal: Tensor) -> Tensor:
-        channels = signal.shape[1]
-        wide = signal.float()
-        if channels % 16:
-            wide = torch.zeros(self._gaussians, padded_channels(channels))
-            wide[:, :channels] = signal
-        image = torch.empty(self._height * self._width, channels)
-        self._matrix.render(wide, channels, image)
-        return image.to(signal.dtype)
-
-    def _adjoint(self, image: Tensor) -> Tensor:
-        channels = image.shape[1]
-        sums = torch.zeros(self._gaussians, padded_channels(channels))
-        weights = torch.zeros(self._gaussians)
-        self._matrix.back_project(image.float(), channels, sums, weights)
-        if sums.shape[1] != channels:
-            sums = sums[:, :channels].contiguous()
-        return sums.to(image.dtype)
-
-    def part_sums(self, part: Int32[Tensor, "pixels"]) -> PartSums:
-        """Sum W over each part of the image, block by block and then part by part."""
-        check_shape("part", part, (self._height * self._width,))
-        of, indptr, ids, sums = self._matrix.sums_of_parts(part.to(torch.int32).contiguous())
-        parts = max(0, int(part.max()) + 1) if len(part) else 0
-        # Within a part the blocks stay in their order.
-        order = np.argsort(of, kind="stable").astype(np.int32)
-        begin = np.searchsorted(of[order], np.arange(parts + 1))
-        ones = np.ones(len(order), np.float32)
-        found = _native.sparse_product(
-            begin, order, ones, indptr[:-1], indptr[1:], ids, sums, self._gaussians
-        )
-        return PartSums(
-            indptr=torch.from_numpy(found[0]),
-            ids=torch.from_numpy(found[1]),
-            sums=torch.from_numpy(found[2]),
-        )
+    of, indptr, ids, sums = matrix.sums_of_parts(part.to(torch.int32).contiguous())
+    parts = max(0, int(part.max()) + 1)
+    # Within a part the blocks stay in their order.
+    order = np.argsort(of, kind="stable").astype(np.int32)
+    begin = np.searchsorted(of[order], np.arange(parts + 1))
+    ones = np.ones(len(order), np.float32)
+    found = _native.sparse_product(
+        begin, order, ones, indptr[:-1], indptr[1:], ids, sums, gaussians
+    )
+    return sparse.csr_matrix((found[2], found[1], found[0]), shape=(parts, gaussians))
 
 
 def _rows_of_blocks(matrix: _native.BlockMatrix, *, gaussians: int, pixels: int) -> SparseWeights:

@@ -15,7 +15,6 @@ from splatseg.core import Camera, Gaussians
 from splatseg.core.sh import evaluate_sh
 from splatseg.errors import BackendError, InputError, MissingPackageError
 from splatseg.render._backend import Backend, BackendView, needs_graph
-from splatseg.render._products import ImageWeights
 from splatseg.render._rows import SparseWeights
 from splatseg.render._values import (
     ALPHA_MIN,
@@ -25,7 +24,7 @@ from splatseg.render._values import (
     Rendered,
     RenderOptions,
 )
-from splatseg.render.blending import Entries, blocks_from_csr
+from splatseg.render.blending import Entries
 from splatseg.render.reference import contributors_from_entries, rows_from_entries
 
 
@@ -336,10 +335,6 @@ class CudaBackendView(BackendView):
         count = self._camera.width * self._camera.height if pixels is None else len(pixels)
         found = self._entries(pixels)
         return rows_from_entries(found, k, shape=(count, len(self._gaussians)))
-
-    def blocks(self) -> ImageWeights:
-        """W in blocks of 4 x 4 pixels."""
-        return blocks_from_csr(self.rows(None, None), self._camera.width, self._camera.height)
 
     def _on_device(self, *, graph: bool = False) -> tuple[Gaussians, CudaView]:
         """The Gaussians and their projection; new ones for a graph."""

@@ -5,12 +5,14 @@ For a camera with distortion the view is the product of two sparse matrices, :ma
 identity and nothing is resampled. The warp depends on the lens alone and is kept by itself.
 """
 
-from typing import Self
+from collections.abc import Sequence
+from typing import Any, Self
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from splatseg._check import check_shape
 from splatseg.core import Camera, Gaussians
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, RangeError, ShapeError
@@ -24,7 +26,6 @@ from splatseg.render._backend import (
     get_backend,
     options_for,
 )
-from splatseg.render._products import ImageWeights
 from splatseg.render._rows import SparseWeights
 from splatseg.render._values import (
     BackProjected,
@@ -252,16 +253,28 @@ class PreparedView:
             pixels = self._in_pinhole(pixels)
         return self._view.rows(pixels, k)
 
-    def image_weights(self) -> ImageWeights:
-        """W of the whole image in blocks, see `splatseg.render.image_weights`.
+    @boundary
+    def part_sums(self, parts: Sequence[Int[Tensor, "pixels"]]) -> list[Any]:
+        """Rows of W summed over parts of the image, without those rows.
+
+        Weights are half precision and sums double: they are exact.
+
+        Args:
+            parts: Partitions of the image: the part of each pixel, row by row, from 0; negative
+                where it is in none.
+
+        Returns:
+            Of each partition a ``scipy.sparse.csr_matrix`` (parts, Gaussians), indices ascending.
 
         Raises:
-            InputError: If the camera has distortion: a block of the photograph is no block of the
-                pinhole image.
+            InputError: If the camera has distortion.
+            ShapeError: If a partition is of another image.
         """
         if not self._camera.is_pinhole:
             raise InputError("camera: expected one without distortion; `weights` takes any.")
-        return self._view.blocks()
+        for part in parts:
+            check_shape("part", part, (self._camera.height * self._camera.width,))
+        return self._view.part_sums([part.cpu().to(torch.int32).contiguous() for part in parts])
 
     def _in_pinhole(self, pixels: Tensor) -> Tensor:
         if self._camera.is_pinhole:
@@ -439,28 +452,3 @@ def weights(
     """
     with prepare(gaussians, camera, options=options, backend=backend) as view:
         return view.weights(pixels, k)
-
-
-@boundary
-def image_weights(
-    gaussians: Gaussians,
-    camera: Camera,
-    *,
-    options: RenderOptions | None = None,
-    backend: str = "auto",
-) -> ImageWeights:
-    """W of the whole image of a pinhole camera in blocks of 4 x 4 pixels, all entries.
-
-    Faster than `weights`, and sums of parts of the image are made of it.
-
-    Args:
-        gaussians: The Gaussians of the scene.
-        camera: A camera without distortion.
-        options: As for `render`.
-        backend: As for `render`.
-
-    Raises:
-        InputError: If the camera has distortion.
-    """
-    with prepare(gaussians, camera, options=options, backend=backend) as view:
-        return view.image_weights()

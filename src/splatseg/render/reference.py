@@ -11,13 +11,11 @@ from splatseg.core import Camera, Gaussians
 from splatseg.core.sh import evaluate_sh
 from splatseg.errors import InputError
 from splatseg.render._backend import Backend, BackendView, needs_graph
-from splatseg.render._products import ImageWeights
 from splatseg.render._rows import SparseWeights
 from splatseg.render._values import BackProjected, Contributors, Rendered, RenderOptions
 from splatseg.render.blending import (
     Entries,
     Projected,
-    blocks_from_csr,
     csr_from_entries,
     entries,
     project,
@@ -144,10 +142,6 @@ class ReferenceView(BackendView):
             pixels = all_pixels(self._camera).to(self._gaussians.device)
         found = entries(self._project(), pixels.long(), alpha_max=self._options.alpha_max)
         return rows_from_entries(found, k, shape=(len(pixels), len(self._gaussians)))
-
-    def blocks(self) -> ImageWeights:
-        """W in blocks of 4 x 4 pixels."""
-        return blocks_from_csr(self.rows(None, None), self._camera.width, self._camera.height)
 
 
 def _colours(

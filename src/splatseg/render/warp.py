@@ -8,7 +8,7 @@ in it:
 .. math:: \text{photograph} = R \, W \, \text{signal}, \qquad
           \text{sums} = W^\top R^\top \, \text{photograph}
 
-`Warp` holds R as lists of entries in both orders, so that `apply` is R, `adjoint` is exactly its
+`Warp` holds R as sparse rows in both orders, so that `apply` is R, `adjoint` is exactly its
 transpose, both are sums in a fixed order, and both are differentiable.
 """
 
@@ -23,7 +23,7 @@ from torch import Tensor
 from splatseg._check import check_choice, check_shape
 from splatseg.core import Camera
 from splatseg.errors import InputError
-from splatseg.render._products import LinearMap
+from splatseg.render._products import Csr, LinearMap, starts_of
 
 WarpMode = Literal["bilinear", "nearest"]
 
@@ -55,8 +55,8 @@ class Warp:
     valid: Bool[Tensor, "target_rows target_columns"]
     """True where a target pixel has a counterpart in the source image."""
 
-    _forward: "_Rows"
-    _transposed: "_Rows"
+    _rows: Csr
+    _columns: Csr
 
     @classmethod
     def between(cls, target: Camera, source: Camera, mode: WarpMode = "bilinear") -> "Warp":
@@ -84,32 +84,27 @@ class Warp:
                 "target, source: expected two cameras with the same pose, got different ones."
             )
         at, valid = _meeting_points(target, source)
-        entries = _taps(at, source, mode)
-        columns, values = (part[valid] for part in entries)
-        pixels = target.height * target.width
-        rows = torch.arange(pixels).reshape(valid.shape)[valid]
-        rows = rows.unsqueeze(-1).expand_as(columns)
-        forward = _Rows.of(rows.reshape(-1), columns.reshape(-1), values.reshape(-1), pixels)
-        source_pixels = source.height * source.width
-        transposed = _Rows.of(
-            columns.reshape(-1), rows.reshape(-1), values.reshape(-1), source_pixels
+        columns, values = (part[valid] for part in _taps(at, source, mode))
+        rows = Csr(
+            indptr=starts_of(valid.flatten() * columns.shape[1]),
+            ids=columns.flatten().int(),
+            weights=values.flatten(),
+            columns=source.height * source.width,
         )
         return cls(
             target_shape=(target.height, target.width),
             source_shape=(source.height, source.width),
             valid=valid,
-            _forward=forward,
-            _transposed=transposed,
+            _rows=rows,
+            _columns=rows.transposed(),
         )
 
     @property
     def _map(self) -> LinearMap:
-        return LinearMap(forward=self._forward.times, adjoint=self._transposed.times)
-
-    @property
-    def nbytes(self) -> int:
-        """Memory it holds."""
-        return self._forward.nbytes + self._transposed.nbytes + self.valid.nbytes
+        return LinearMap(
+            forward=lambda values: self._rows.to(values.device).product(values),
+            adjoint=lambda values: self._columns.to(values.device).product(values),
+        )
 
     def apply(
         self, image: Float[Tensor, "source_rows source_columns channels"]
@@ -149,12 +144,11 @@ class Warp:
         if not bool(found.any()):
             return torch.zeros_like(pixels, dtype=torch.int64), found.to(pixels.device)
         # Every valid row has the same number of entries.
-        starts = self._forward.offsets[rows].long()
-        taps = int((self._forward.offsets[1:] - self._forward.offsets[:-1]).max())
-        entries = starts.unsqueeze(1) + torch.arange(taps)
-        entries = entries.clamp_max(len(self._forward.columns) - 1)
-        best = self._forward.values[entries].argmax(dim=1, keepdim=True)
-        source = self._forward.columns[entries].long().gather(1, best).squeeze(1)
+        taps = int(self._rows.indptr.diff().max())
+        entries = self._rows.indptr[rows].unsqueeze(1) + torch.arange(taps)
+        entries = entries.clamp_max(len(self._rows.ids) - 1)
+        best = self._rows.weights[entries].argmax(dim=1, keepdim=True)
+        source = self._rows.ids[entries].long().gather(1, best).squeeze(1)
         source = torch.where(found, source, 0)
         width = self.source_shape[1]
         at = torch.stack((source % width, source // width), dim=-1)
@@ -265,41 +259,3 @@ def _taps(at: Tensor, source: Camera, mode: WarpMode) -> tuple[Tensor, Tensor]:
             down = fraction[..., 1] if dy else 1 - fraction[..., 1]
             weights.append(across * down)
     return torch.stack(columns, dim=-1), torch.stack(weights, dim=-1).float()
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Rows:
-    """Compressed sparse rows of a matrix."""
-
-    offsets: Tensor
-    columns: Tensor
-    values: Tensor
-
-    @classmethod
-    def of(cls, rows: Tensor, columns: Tensor, values: Tensor, count: int) -> "_Rows":
-        order = torch.argsort(rows, stable=True)
-        offsets = torch.zeros(count + 1, dtype=torch.int64)
-        offsets[1:] = torch.cumsum(torch.bincount(rows, minlength=count), dim=0)
-        return cls(
-            offsets=offsets.int(),
-            columns=columns[order].int(),
-            values=values[order].contiguous(),
-        )
-
-    @property
-    def nbytes(self) -> int:
-        return self.offsets.nbytes + self.columns.nbytes + self.values.nbytes
-
-    def times(self, dense: Tensor) -> Tensor:
-        if not len(self.columns) or not dense.shape[1]:
-            return dense.new_zeros(len(self.offsets) - 1, dense.shape[1])
-        # A bag of embeddings is a row of a sparse product: weighted rows of the table, summed
-        # in order, in parallel over bags.
-        return torch.nn.functional.embedding_bag(
-            self.columns.to(dense.device),
-            dense.contiguous(),
-            self.offsets.to(dense.device),
-            mode="sum",
-            per_sample_weights=self.values.to(dense),
-            include_last_offset=True,
-        )

@@ -1,4 +1,4 @@
-"""Label maps, depth and errors as pictures, and pictures side by side on one sheet."""
+"""Label maps, depth, errors and selections as pictures, and galleries of them."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -7,15 +7,12 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw
 from torch import Tensor
 
-from splatseg._check import check_shape
 from splatseg.core import ClassTable
-from splatseg.errors import InputError
-from splatseg.report.colours import NOTHING, Colour, colour_labels, colour_of
-
-_Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
+from splatseg.core.boundary import convert_fields
+from splatseg.report.colours import NOTHING, Colour, colour_labels
 
 _WRONG: Colour = (226, 48, 48)
 _UNKNOWN: Colour = (90, 120, 220)
@@ -27,12 +24,6 @@ SHADES: tuple[Colour, ...] = (
     (244, 226, 150),
 )
 """From far to near, from little to much: dark blue, teal, sand. Brightness grows steadily."""
-
-_PAPER: Colour = (250, 249, 246)
-_INK: Colour = (32, 34, 40)
-_QUIET: Colour = (112, 114, 122)
-_MARGIN = 20
-_GAP = 6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,9 +40,7 @@ class GalleryImage:
     """A photo is embedded as JPEG, a chart (few flat colours) as PNG without loss."""
 
     def __post_init__(self) -> None:
-        check_shape("image", self.image, (None, None, 3))
-        if self.image.dtype != torch.uint8:
-            raise InputError(f"image: expected 8-bit colours (uint8), got {self.image.dtype}.")
+        convert_fields(self)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -188,73 +177,6 @@ def mark_errors(
     return out.clamp(0, 255).round().to(torch.uint8)
 
 
-def contact_sheet(
-    gallery: Gallery,
-    *,
-    subtitle: str = "",
-    classes: ClassTable | None = None,
-    cell_width: int = 320,
-) -> UInt8[Tensor, "height width 3"]:
-    """All pictures of a gallery on one sheet, with its title and labels.
-
-    Args:
-        gallery: What is shown.
-        subtitle: A line under the title.
-        classes: Classes whose colours are explained in a line below; None leaves it out.
-        cell_width: Width of each picture on the sheet, pixels.
-
-    Raises:
-        InputError: If there are no pictures.
-    """
-    if not gallery.rows or not gallery.columns:
-        raise InputError("gallery: expected at least one row and one column of pictures.")
-    title_font, text_font, label_font = (ImageFont.load_default(size) for size in (26, 16, 13))
-    head = _MARGIN + 36 + (24 if subtitle else 0) + 26
-    heights = [max(_scaled_height(p, cell_width) for p in pics) for _, pics in gallery.rows]
-    label_height = 20
-    width = 2 * _MARGIN + len(gallery.columns) * (cell_width + _GAP) - _GAP
-    height = head + sum(heights) + len(heights) * (label_height + _GAP) + _MARGIN
-    swatches = _swatches(classes, label_font, width)
-    height += max((y for _, y, _, _ in swatches), default=-22) + 22
-    sheet = Image.new("RGB", (width, height), _PAPER)
-    draw = ImageDraw.Draw(sheet)
-    draw.text((_MARGIN, _MARGIN - 4), gallery.title, fill=_INK, font=title_font)
-    if subtitle:
-        draw.text((_MARGIN, _MARGIN + 32), subtitle, fill=_QUIET, font=text_font)
-    for column, name in enumerate(gallery.columns):
-        x = _MARGIN + column * (cell_width + _GAP)
-        draw.text((x, head - 22), name, fill=_INK, font=text_font)
-    y = head
-    for (label, panels), row_height in zip(gallery.rows, heights, strict=True):
-        for column, panel in enumerate(panels):
-            x = _MARGIN + column * (cell_width + _GAP)
-            small = _resized(panel, cell_width)
-            sheet.paste(small, (x, y))
-            words = label if column == 0 else panel.caption
-            words = _fitting(draw, words, label_font, cell_width)
-            draw.text((x, y + row_height + 2), words, fill=_QUIET, font=label_font)
-        y += row_height + label_height + _GAP
-    for x, down, name, colour in swatches:
-        draw.rectangle((x, y + down + 2, x + 11, y + down + 13), fill=colour)
-        draw.text((x + 17, y + down), name, fill=_QUIET, font=label_font)
-    return torch.from_numpy(np.array(sheet))
-
-
-def _swatches(
-    classes: ClassTable | None, font: _Font, width: int
-) -> list[tuple[int, int, str, Colour]]:
-    """Places (x, y from the top of the legend), names and colours, in lines that fit."""
-    x, y = _MARGIN, 0
-    out: list[tuple[int, int, str, Colour]] = []
-    for row in () if classes is None else classes.rows:
-        needed = 17 + int(font.getlength(row.name)) + 18
-        if x + needed > width - _MARGIN and x > _MARGIN:
-            x, y = _MARGIN, y + 20
-        out.append((x, y, row.name, colour_of(row.id, classes)))
-        x += needed
-    return out
-
-
 def _ramp(share: Tensor) -> Tensor:
     """Colours, as float64, of values in [0, 1]."""
     steps = torch.tensor(SHADES, dtype=torch.float64)
@@ -266,30 +188,6 @@ def _ramp(share: Tensor) -> Tensor:
 def _thinned(values: Tensor) -> Tensor:
     """At most about a million values: `torch.quantile` takes no more than 16 million."""
     return values[:: max(1, len(values) // 1_000_000)]
-
-
-def _scaled_height(panel: GalleryImage, width: int) -> int:
-    return max(1, round(panel.image.shape[0] * width / panel.image.shape[1]))
-
-
-def _resized(panel: GalleryImage, width: int) -> Image.Image:
-    """A photo smoothly, a chart without mixing its colours."""
-    method = Image.Resampling.LANCZOS if panel.kind == "photo" else Image.Resampling.NEAREST
-    image = Image.fromarray(panel.image.cpu().numpy())
-    return image.resize((width, _scaled_height(panel, width)), method)
-
-
-def _fitting(
-    draw: ImageDraw.ImageDraw,
-    text: str,
-    font: _Font,
-    width: int,
-) -> str:
-    if draw.textlength(text, font=font) <= width:
-        return text
-    while text and draw.textlength(text + "...", font=font) > width:
-        text = text[:-1]
-    return text.rstrip() + "..."
 
 
 # A view with a selection outlined and the prompts that made it.

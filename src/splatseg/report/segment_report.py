@@ -50,9 +50,9 @@ from splatseg.report.segment_tables import (
     fact_rows,
     id_table,
     instances_without_labels,
-    seen_id_table,
     support_table,
     training_blocks,
+    visible_id_table,
 )
 from splatseg.report.segment_views import (
     ViewPanel,
@@ -358,7 +358,7 @@ def _page(made: _Segmentation, *, longest: int) -> Report:
     blocks += training_blocks(made.summary.info)
     scores = made.score.per_class if isinstance(made.score, SemanticScore) else {}
     blocks.append(
-        seen_id_table(made.panels, made.classes, scores=scores, scored=made.scored)
+        visible_id_table(made.panels, made.classes, scores=scores, scored=made.scored)
         if labels is None
         else id_table(labels, made.classes, scores=scores, scored=made.scored)
     )

@@ -234,7 +234,7 @@ def id_table(
     return _largest_first(columns, rows, scored if scores else "")
 
 
-def seen_id_table(
+def visible_id_table(
     panels: Sequence[ViewPanel], classes: ClassTable, *, scores: Mapping[int, float], scored: str
 ) -> Table:
     """One row an id: how many pixels of the views shown, how sure, how good where it is known."""

@@ -1,7 +1,6 @@
 """The page of a mesh field of a drive: what was built, how it went, and what it shows."""
 
 import math
-import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -30,27 +29,6 @@ class LevelFacts:
 
     kept: int
     """Of these, after those were removed that stood before surfaces or around cameras."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DepthError:
-    """How far first hits of the rays of a view are from its known depth."""
-
-    view: str
-    rays: int
-    """Whose depth is known."""
-
-    before: float | None
-    """Median over the rays that meet a primitive, metres, before shapes were fitted; None where
-    no ray meets one."""
-
-    after: float | None
-    """The same once the field was made."""
-
-    met_before: float
-    """Share of the rays that meet a primitive, in [0, 1]."""
-
-    met_after: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -116,7 +94,6 @@ class StreetReportData:
     """Of a drive in blocks; 0 where it is one field."""
 
     levels: tuple[LevelFacts, ...] = ()
-    depth: tuple[DepthError, ...] = ()
     shaping: tuple[GeometryRecord, ...] = ()
     training: tuple[RadianceRecord, ...] = ()
     metres_per_unit: float = 1.0
@@ -162,7 +139,6 @@ def street_report(
         None if points is None else _point_table(data, points),
         _score_table(points) if points is not None and points.scores else None,
         _levels(data) if data.levels else None,
-        _depths(data) if data.depth else None,
         how if charts else None,
         _times(data) if data.timings else None,
     ]
@@ -179,6 +155,7 @@ def street_report(
 
 def street_record(data: StreetReportData) -> dict[str, Any]:
     """The same as values that JSON holds."""
+    error = _depth_error(data)
     record: dict[str, Any] = {
         "made_by": "splatseg street",
         "command": data.command,
@@ -188,8 +165,7 @@ def street_record(data: StreetReportData) -> dict[str, Any]:
         "primitives": data.primitives,
         "blocks": data.blocks,
         "levels": [asdict(level) for level in data.levels],
-        "depth": [asdict(row) for row in data.depth],
-        "depth_error": dict(zip(("before", "after"), _medians(data.depth), strict=True)),
+        "depth_error": dict(zip(("first", "last"), error, strict=True)) if error else None,
         "psnr": dict(data.psnr),
         "training": [
             {"iteration": at, "colour_loss": colour, "semantic_loss": semantic}
@@ -222,10 +198,9 @@ def _figures(data: StreetReportData) -> list[Figure]:
     figures: list[Figure] = []
     if data.name:
         figures.append(Figure("primitives", count_text(data.primitives)))
-    before, after = _medians(data.depth)
-    if after is not None:
-        note = "" if before is None else f"median; {before:.2f} m before shapes were fitted"
-        figures.append(Figure("error of depth", f"{after:.2f} m", note))
+    if error := _depth_error(data):
+        note = f"mean of the finest level; {error[0]:.2f} m in its first steps"
+        figures.append(Figure("error of depth", f"{error[1]:.2f} m", note))
     if data.psnr:
         mean = math.fsum(data.psnr.values()) / len(data.psnr)
         note = f"of the {counted(len(data.psnr), 'training view')} shown"
@@ -236,13 +211,12 @@ def _figures(data: StreetReportData) -> list[Figure]:
     return figures
 
 
-def _medians(rows: Sequence[DepthError]) -> tuple[float | None, float | None]:
-    """Medians over views of the errors before and after."""
-    before = [row.before for row in rows if row.before is not None]
-    after = [row.after for row in rows if row.after is not None]
-    return statistics.median(before) if before else None, (
-        statistics.median(after) if after else None
-    )
+def _depth_error(data: StreetReportData) -> tuple[float, float] | None:
+    """Of the rays of the first and of the last steps of the finest level, metres."""
+    finest = [r for r in data.shaping if r.level == 0 and math.isfinite(r.loss)]
+    if not finest:
+        return None
+    return finest[0].loss * data.metres_per_unit, finest[-1].loss * data.metres_per_unit
 
 
 def _levels(data: StreetReportData) -> Table:
@@ -254,21 +228,6 @@ def _levels(data: StreetReportData) -> Table:
         ),
         note="0 is the finest level. What stood before measured surfaces or around a camera was "
         "removed.",
-    )
-
-
-def _depths(data: StreetReportData) -> Table:
-    rows = [
-        (row.view, row.rays, row.before, row.after, row.met_before, row.met_after)
-        for row in data.depth
-    ]
-    return Table(
-        "Error of depth",
-        ("view", "rays", "before, m", "after, m", "met before", "met after"),
-        tuple(rows),
-        note="Median distance between where rays first meet a primitive and their known depth, "
-        "before shapes were fitted and after, over the rays that meet one, and the share of these. "
-        "Views that were learned from; primitives around cameras are left out.",
     )
 
 

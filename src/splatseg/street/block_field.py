@@ -11,13 +11,12 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from typing_extensions import override
 
 from splatseg._check import check_shape
 from splatseg.core import (
     UNLABELLED,
     Camera,
-    Capture,
-    PointCloud,
     PointLabels,
     Renderable,
     RenderableLayer,
@@ -306,25 +305,6 @@ around it."""
 
 
 @boundary
-def block_capture(capture: Capture, drive: DriveBlocks, block: DriveBlock) -> Capture:
-    """The part of a capture that a block is made from.
-
-    Its views are those at whose place the block counts, so that views of an overlap are of both
-    blocks; its start points are those in reach. Photographs are not looked at.
-
-    Args:
-        capture: The whole drive.
-        drive: How it was cut.
-        block: One of its blocks.
-
-    Raises:
-        InputError: If no training view is of the block.
-    """
-    views = block_views(capture.views, drive, block)
-    return replace(capture, views=views, points=_cloud(capture.points, drive, block))
-
-
-@boundary
 def block_views(views: Sequence[View], drive: DriveBlocks, block: DriveBlock) -> tuple[View, ...]:
     """The views at whose place a block counts, in their order.
 
@@ -341,14 +321,6 @@ def block_views(views: Sequence[View], drive: DriveBlocks, block: DriveBlock) ->
             "has none; longer blocks bridge a gap of the drive."
         )
     return found
-
-
-def _cloud(cloud: PointCloud | None, drive: DriveBlocks, block: DriveBlock) -> PointCloud | None:
-    if cloud is None:
-        return None
-    near = drive.near(block, cloud.points)
-    colours = None if cloud.colours is None else cloud.colours[near]
-    return PointCloud(points=cloud.points[near], colours=colours)
 
 
 class DriveScans:
@@ -441,47 +413,37 @@ class _NearScans:
         return self._names
 
     def scan(self, name: str) -> Scan:
-        """One of them, its far points left out."""
-        _check_name(name, self._names)
+        """One of them, its other points left out."""
+        if name not in self._names:
+            raise InputError(f"scan: there is no {name!r:.80} in this block of the drive.")
         scan = self._scans.scan(name)
-        near = self._drive.near(self._block, scan.points)
-        return scan.take(torch.nonzero(near).squeeze(1))
+        return scan.take(self._kept(name, scan))
+
+    def _kept(self, name: str, scan: Scan) -> Int[Tensor, "n"]:
+        return torch.nonzero(self._drive.near(self._block, scan.points)).squeeze(1)
 
 
-class ScansToLabel:
+class ScansToLabel(_NearScans):
     """Some scans of a source, and their points at which a block counts; a `core.ScanSource`."""
 
     def __init__(
         self, scans: ScanSource, names: Sequence[str], drive: DriveBlocks, block: DriveBlock
     ) -> None:
         """Take what `DriveScans.to_label` knows."""
-        self._scans, self._names = scans, tuple(names)
-        self._drive, self._block = drive, block
+        super().__init__(scans, names, drive, block)
         self._read: OrderedDict[str, BlockShare] = OrderedDict()
 
-    @property
-    def scan_names(self) -> Sequence[str]:
-        """Scans in the order of the source."""
-        return self._names
-
-    def scan(self, name: str) -> Scan:
-        """One of them, its other points left out."""
-        _check_name(name, self._names)
-        scan = self._scans.scan(name)
+    @override
+    def _kept(self, name: str, scan: Scan) -> Int[Tensor, "n"]:
         share = next(s for s in self._drive.shares(scan.points) if s.block == self._block.index)
         self._read[name] = share
         self._read.move_to_end(name)
         if len(self._read) > _KEPT_SHARES:
             self._read.popitem(last=False)
-        return scan.take(share.rows)
+        return share.rows
 
     def share(self, name: str) -> BlockShare:
         """What the block counts at these points of a scan, known still if it was read lately."""
         if name not in self._read:
             self.scan(name)
         return self._read.pop(name)
-
-
-def _check_name(name: str, names: Sequence[str]) -> None:
-    if name not in names:
-        raise InputError(f"scan: there is no {name!r:.80} in this block of the drive.")

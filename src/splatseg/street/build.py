@@ -229,7 +229,7 @@ def build_mesh_field(
     )
     with torch.no_grad():
         trained.model.features.copy_(trained.model.features.half().float())
-    seen = seen_shares(trained.seen)
+    seen = visible_shares(trained.seen)
     info = _record(inputs, options, shaped, mesh, trained, seed=seed)
     field = MeshField(
         mesh,
@@ -273,7 +273,7 @@ def _record(
     )
 
 
-def seen_shares(seen: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
+def visible_shares(seen: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
     """What vertices that so many rays saw count in eq. 9, in [0, 1], as float16 holds it.
 
     Above 0 exactly where a ray adjusted the vertex, however little it saw of it.

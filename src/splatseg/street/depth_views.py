@@ -71,15 +71,6 @@ def axis_cosines(camera: Camera, directions: Float[Tensor, "*n 3"]) -> Float[Ten
     return directions @ camera.cam_from_world[2, :3].to(directions)
 
 
-@boundary
-def distances_of(view: DepthView) -> Float[Tensor, "height width"]:
-    """Distances along the rays of the pixels' centres, 0 where no depth is known."""
-    _, directions = view.camera.rays()
-    cosines = axis_cosines(view.camera, directions)
-    seen = (view.depth > 0) & (cosines > 0)
-    return torch.where(seen, view.depth / torch.where(seen, cosines, 1.0), 0.0).float()
-
-
 def collect_rays(
     views: Iterable[DepthView], *, max_rays: int, max_depth: float, generator: torch.Generator
 ) -> DepthRays:

@@ -5,27 +5,33 @@ once the tensors that they ask for are known to be in it.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Annotated, Any
 
 import torch
-from jaxtyping import Float
+from msgspec import Meta
 from torch import Tensor
 
 from splatseg.core import LayerInfo, RenderableLayer, layer_info_from_json, layer_info_to_json
 from splatseg.core.boundary import boundary
-from splatseg.core.json_values import json_integer, json_number
 from splatseg.core.options import removed_options
 from splatseg.errors import FileFormatError, MissingFileError, quoted, visible
 from splatseg.io.atomic import named_write_failures, path_inside
-from splatseg.io.foreign import made_from
-from splatseg.io.json_files import json_text, parse_object, read_json, write_json
+from splatseg.io.foreign import derived_from, expect
+from splatseg.io.json_files import (
+    check_version,
+    json_text,
+    parse_object,
+    read_json,
+    write_json,
+)
 from splatseg.io.scene import DRIVE_FILE
+from splatseg.io.schema import read_structured, structured
 from splatseg.io.tensors import read_safetensors, read_safetensors_words, write_tensors
 from splatseg.street.block_field import DriveField, joined_layers
 from splatseg.street.blocks import DriveBlock, DriveBlocks
-from splatseg.street.field import VERTEX_RULES, MeshField, VertexRule, with_vertex_rule
+from splatseg.street.field import MeshField, VertexRule, with_vertex_rule
 from splatseg.street.primitives import PrimitiveMesh
 from splatseg.street.radiance import RadianceModel, RadianceOptions
 from splatseg.street.shapes import VERTICES
@@ -36,8 +42,32 @@ VERSION = "1"
 _MODEL = "model."
 """What names of the tensors of the networks and features begin with."""
 
-_KEYS = ("sizes", "ids", "layer", "radius", "options", "info")
-_MAX_ID = 2**31 - 1
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _About:
+    """What the header of a field says."""
+
+    sizes: tuple[float, ...]
+    ids: tuple[Annotated[int, Meta(ge=1, le=2**31 - 1)], ...]
+    layer: str
+    radius: float
+    options: dict[str, Any]
+    info: dict[str, Any]
+    vertex_rule: VertexRule | None = None
+    """None where the first files of this version say none: it is told by `seen` then."""
+
+    @classmethod
+    def of(cls, metadata: Mapping[str, str], path: Path) -> "_About":
+        expect(metadata.get("format") == FORMAT, path, "a mesh field", metadata.get("format"))
+        version = metadata.get("version")
+        expect(version == VERSION, path, f"a mesh field of version {VERSION}", version)
+        where = f"{path}: about"
+        return structured(parse_object(metadata.get("about", ""), where=where), cls, where=where)
+
+    def layer_info(self, path: Path) -> LayerInfo:
+        """The record of the layer."""
+        return layer_info_from_json(self.info, where=f"{path}: info")
+
 
 _ADDED: Mapping[str, object] = {"sides": "both"}
 """Options that the first files of this version lack, and what these were made with."""
@@ -89,19 +119,20 @@ def load_mesh_field(path: Path) -> MeshField:
         FileFormatError: If it is damaged, cut short, no such field, or of a later version.
     """
     tensors, metadata = read_safetensors(path)
-    about = _about(metadata, path)
-    ids = _ids(about, path)
-    with made_from(path):
-        mesh = _mesh(tensors, about, path)
-        model = _model(tensors, mesh, ids, _options(about, path), path)
+    about = _About.of(metadata, path)
+    seen = tensors.get("seen")
+    if seen is not None and not seen.is_floating_point():
+        raise FileFormatError(f"{path}: seen: expected floating-point numbers, got {seen.dtype}.")
+    with derived_from(path):
+        mesh = _mesh(tensors, about.sizes, path)
         return MeshField(
             mesh,
-            model,
-            layer=_layer_name(about, path),
-            info=_info(about, path),
-            radius=json_number(about["radius"], where=f"{path}: radius"),
-            seen=_seen(tensors, path),
-            vertex_rule=_vertex_rule(about, path),
+            _model(tensors, mesh, about.ids, _options(about.options, path), path),
+            layer=about.layer,
+            info=about.layer_info(path),
+            radius=about.radius,
+            seen=None if seen is None else seen.float(),
+            vertex_rule=about.vertex_rule,
         )
 
 
@@ -113,57 +144,11 @@ def load_mesh_field_layer(path: Path) -> tuple[str, RenderableLayer]:
         MissingFileError: If there is no such file.
         FileFormatError: If its header is damaged, or that of no such field.
     """
-    about = _about(read_safetensors_words(path), path)
-    layer = RenderableLayer(ids=tuple(sorted(_ids(about, path))), info=_info(about, path))
-    return _layer_name(about, path), layer
+    about = _About.of(read_safetensors_words(path), path)
+    return about.layer, RenderableLayer(ids=tuple(sorted(about.ids)), info=about.layer_info(path))
 
 
-def _ids(about: Mapping[str, Any], path: Path) -> tuple[int, ...]:
-    return tuple(
-        json_integer(id, where=f"{path}: ids", low=1, high=_MAX_ID)
-        for id in _list(about, "ids", path)
-    )
-
-
-def _layer_name(about: Mapping[str, Any], path: Path) -> str:
-    if not isinstance(about["layer"], str):
-        raise FileFormatError(f"{path}: expected a name as layer, got {quoted(about['layer'])}.")
-    return about["layer"]
-
-
-def _info(about: Mapping[str, Any], path: Path) -> LayerInfo:
-    info = about["info"]
-    if not isinstance(info, dict):
-        raise FileFormatError(f"{path}: expected an object as info, got {quoted(info)}.")
-    return layer_info_from_json(cast("dict[str, Any]", info), where=f"{path}: info")
-
-
-def _about(metadata: Mapping[str, str], path: Path) -> dict[str, Any]:
-    if metadata.get("format") != FORMAT:
-        raise FileFormatError(
-            f"{path}: expected a mesh field, got {quoted(metadata.get('format'))}."
-        )
-    if metadata.get("version") != VERSION:
-        raise FileFormatError(
-            f"{path}: expected a mesh field of version {VERSION}, got version "
-            f"{quoted(metadata.get('version'))}; a later splatseg wrote it."
-        )
-    about = parse_object(metadata.get("about", ""), where=f"{path}: about")
-    missing = [key for key in _KEYS if key not in about]
-    if missing:
-        raise FileFormatError(f"{path}: about: expected {', '.join(missing)}, got none.")
-    return about
-
-
-def _list(about: Mapping[str, Any], key: str, path: Path) -> list[object]:
-    values = about[key]
-    if not isinstance(values, list):
-        raise FileFormatError(f"{path}: {key}: expected a list, got {quoted(values)}.")
-    return cast("list[object]", values)
-
-
-def _mesh(tensors: Mapping[str, Tensor], about: Mapping[str, Any], path: Path) -> PrimitiveMesh:
-    sizes = [json_number(v, where=f"{path}: sizes") for v in _list(about, "sizes", path)]
+def _mesh(tensors: Mapping[str, Tensor], sizes: tuple[float, ...], path: Path) -> PrimitiveMesh:
     levels = _tensor(tensors, "levels", path)
     vertices = _tensor(tensors, "vertices", path)
     if levels.dtype != torch.uint8 or levels.ndim != 1 or vertices.dtype != torch.float32:
@@ -176,37 +161,16 @@ def _mesh(tensors: Mapping[str, Tensor], about: Mapping[str, Any], path: Path) -
             f"{path}: expected {VERTICES} vertices for each of {len(levels)} primitives, got "
             f"shape {tuple(vertices.shape)}."
         )
-    return PrimitiveMesh(vertices=vertices, levels=levels.long(), sizes=tuple(sizes))
+    return PrimitiveMesh(vertices=vertices, levels=levels.long(), sizes=sizes)
 
 
-def _seen(tensors: Mapping[str, Tensor], path: Path) -> Tensor | None:
-    seen = tensors.get("seen")
-    if seen is not None and not seen.is_floating_point():
-        raise FileFormatError(f"{path}: seen: expected floating-point numbers, got {seen.dtype}.")
-    return None if seen is None else seen.float()
-
-
-def _vertex_rule(about: Mapping[str, Any], path: Path) -> VertexRule | None:
-    """None where the first files of this version say none: it is told by `seen` then."""
-    rule = about.get("vertex_rule")
-    if rule is not None and rule not in VERTEX_RULES:
-        raise FileFormatError(
-            f"{path}: vertex_rule: expected one of {', '.join(VERTEX_RULES)}, got {quoted(rule)}."
-        )
-    return rule
-
-
-def _options(about: Mapping[str, Any], path: Path) -> RadianceOptions:
-    if not isinstance(about["options"], dict):
-        raise FileFormatError(
-            f"{path}: expected an object as options, got {quoted(about['options'])}."
-        )
-    given: dict[str, Any] = {**_ADDED, **cast("dict[str, Any]", about["options"])}
+def _options(recorded: Mapping[str, Any], path: Path) -> RadianceOptions:
+    given: dict[str, Any] = {**_ADDED, **recorded}
     for name, value in _FIXED.items():
         if given.pop(name, value) != value:
             raise FileFormatError(
                 f"{path}: options: expected {value} as {name}, which no field has another of, "
-                f"got {quoted(about['options'][name])}."
+                f"got {quoted(recorded[name])}."
             )
     names = {field.name for field in fields(RadianceOptions)}
     unknown = sorted(set(given) - names - removed_options(RadianceOptions).keys())
@@ -335,12 +299,7 @@ def drive_about(folder: Path) -> Mapping[str, Any]:
         MissingFileError: If there is no drive.
         FileFormatError: If drive.json is broken.
     """
-    about = read_json(folder / DRIVE_FILE).get("about")
-    if not isinstance(about, dict):
-        raise FileFormatError(
-            f"{folder / DRIVE_FILE}: expected an object as about, got {quoted(about)}."
-        )
-    return cast("dict[str, Any]", about)
+    return read_structured(folder / DRIVE_FILE, _Drive).about
 
 
 @boundary
@@ -425,25 +384,39 @@ def load_drive(path: Path) -> DriveBlocks:
         FileFormatError: If it is broken, no such file, or of a later version.
     """
     content = read_json(path)
-    if content.get("format") != DRIVE_FORMAT:
-        raise FileFormatError(f"{path}: expected a drive, got {quoted(content.get('format'))}.")
-    if content.get("version") != DRIVE_VERSION:
-        raise FileFormatError(
-            f"{path}: expected a drive of version {DRIVE_VERSION}, got "
-            f"{quoted(content.get('version'))}."
+    check_version(path, content, format=DRIVE_FORMAT, version=DRIVE_VERSION, what="a drive")
+    drive = structured(content, _Drive, where=path)
+    with derived_from(path):
+        blocks = tuple(
+            DriveBlock(
+                index=i,
+                start=block.start,
+                end=block.end,
+                piece=torch.tensor(block.piece, dtype=torch.float64),
+                span=torch.tensor(block.span, dtype=torch.float64),
+            )
+            for i, block in enumerate(drive.blocks)
         )
-    rows = content.get("blocks")
-    if not isinstance(rows, list):
-        raise FileFormatError(f"{path}: expected a list of blocks, got none.")
-    with made_from(path):
-        return DriveBlocks(
-            blocks=tuple(
-                _block(row, i, where=f"{path}: blocks[{i}]")
-                for i, row in enumerate(cast("list[object]", rows))
-            ),
-            overlap=json_number(content.get("overlap"), where=f"{path}: overlap"),
-            reach=json_number(content.get("reach"), where=f"{path}: reach"),
-        )
+        return DriveBlocks(blocks=blocks, overlap=drive.overlap, reach=drive.reach)
+
+
+_Line = Annotated[list[tuple[float, float, float]], Meta(min_length=1)]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Block:
+    start: float
+    end: float
+    piece: _Line
+    span: _Line
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Drive:
+    about: dict[str, Any]
+    overlap: float
+    reach: float
+    blocks: list[_Block]
 
 
 def _content(drive: DriveBlocks, about: Mapping[str, Any]) -> dict[str, Any]:
@@ -463,25 +436,3 @@ def _content(drive: DriveBlocks, about: Mapping[str, Any]) -> dict[str, Any]:
             for block in drive.blocks
         ],
     }
-
-
-def _block(row: object, index: int, *, where: str) -> DriveBlock:
-    if not isinstance(row, dict):
-        raise FileFormatError(f"{where}: expected an object, got {quoted(row)}.")
-    values = cast("dict[str, object]", row)
-    return DriveBlock(
-        index=index,
-        start=json_number(values.get("start"), where=f"{where}: start"),
-        end=json_number(values.get("end"), where=f"{where}: end"),
-        piece=_line(values.get("piece"), where=f"{where}: piece"),
-        span=_line(values.get("span"), where=f"{where}: span"),
-    )
-
-
-def _line(value: object, *, where: str) -> Float[Tensor, "n 3"]:
-    rows = cast("list[object]", value) if isinstance(value, list) else []
-    places = [cast("list[object]", row) if isinstance(row, list) else [] for row in rows]
-    if not places or any(len(place) != 3 for place in places):
-        raise FileFormatError(f"{where}: expected places of three numbers, got {quoted(value)}.")
-    numbers = [[json_number(x, where=where) for x in place] for place in places]
-    return torch.tensor(numbers, dtype=torch.float64)

@@ -22,7 +22,6 @@ from splatseg.core.options import (
     Positive,
     options,
 )
-from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError, RangeError
 from splatseg.raycast import through_triangles
 from splatseg.street.depth_views import DepthRays, DepthView, collect_rays
@@ -415,39 +414,38 @@ def fit_geometry(
     check_range("seed", seed, 0, 2**63 - 1)
     if not 0 < metres_per_unit < float("inf"):
         raise RangeError(f"metres_per_unit: expected a positive length, got {metres_per_unit:g}.")
-    with one_torch_thread():
-        rays = collect_rays(
-            depths,
-            max_rays=_MAX_RAYS,
-            max_depth=MAX_DEPTH / metres_per_unit,
-            generator=_generator(seed, 0),
+    rays = collect_rays(
+        depths,
+        max_rays=_MAX_RAYS,
+        max_depth=MAX_DEPTH / metres_per_unit,
+        generator=_generator(seed, 0),
+    )
+    around = enclosing(primitives.mesh(shapes), rays.origins)
+    if bool(around.any()) and options.carve > 1:
+        row = int(around.nonzero()[0])
+        raise InputError(
+            f"primitives: expected none around a camera, got primitive {row} (and "
+            f"{int(around.sum()) - 1} more) with one inside; carving would remove it."
         )
-        around = enclosing(primitives.mesh(shapes), rays.origins)
-        if bool(around.any()) and options.carve > 1:
-            row = int(around.nonzero()[0])
-            raise InputError(
-                f"primitives: expected none around a camera, got primitive {row} (and "
-                f"{int(around.sum()) - 1} more) with one inside; carving would remove it."
-            )
-        left = _left(primitives, ~around)
-        fitted: list[Primitives] = []
-        records: list[GeometryRecord] = []
-        carved = 0
-        levels = torch.unique(left.levels).tolist()
-        for i, level in enumerate(levels):
-            generator = _generator(seed, 1 + level)
-            fit = LevelFit(left.subset(left.levels == level), shapes, options)
-            for record in _records(fit, rays, options, generator):
-                told = replace(record, level=level, progress=(i + record.progress) / len(levels))
-                records.append(told)
-                if progress is not None:
-                    progress(told)
-            found = fit.primitives()
-            if options.carve <= 1:
-                before = fit.before_surfaces(rays, generator)
-                carved += int(before.sum())
-                found = found.subset(~before)
-            fitted.append(found)
+    left = _left(primitives, ~around)
+    fitted: list[Primitives] = []
+    records: list[GeometryRecord] = []
+    carved = 0
+    levels = torch.unique(left.levels).tolist()
+    for i, level in enumerate(levels):
+        generator = _generator(seed, 1 + level)
+        fit = LevelFit(left.subset(left.levels == level), shapes, options)
+        for record in _records(fit, rays, options, generator):
+            told = replace(record, level=level, progress=(i + record.progress) / len(levels))
+            records.append(told)
+            if progress is not None:
+                progress(told)
+        found = fit.primitives()
+        if options.carve <= 1:
+            before = fit.before_surfaces(rays, generator)
+            carved += int(before.sum())
+            found = found.subset(~before)
+        fitted.append(found)
     return GeometryFit(
         primitives=_joined(fitted),
         records=tuple(records),

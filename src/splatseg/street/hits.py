@@ -20,12 +20,9 @@ from torch import Tensor
 
 from splatseg import _native
 from splatseg._check import check_choice, check_finite, check_range, check_shape
-from splatseg.core import Camera
 from splatseg.core.boundary import boundary
-from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError, RangeError
 from splatseg.raycast import RayHits
-from splatseg.street.depth_views import axis_cosines
 from splatseg.street.primitives import PrimitiveMesh
 from splatseg.street.shapes import FACES, VERTICES, template
 
@@ -150,18 +147,17 @@ class MeshCaster:
         faces = torch.empty(len(rays), width, dtype=torch.int64)
         distances = torch.empty(len(rays), width, dtype=torch.float64)
         weights = torch.empty(len(rays), width, 3)
-        with one_torch_thread():
-            for begin in range(0, len(rays), _RAYS):
-                part = slice(begin, begin + _RAYS)
-                own = starts if len(starts) == 1 else starts[part]
-                found = [
-                    level.hits(own, rays[part], limit, front=sides == "front")
-                    for level, limit in zip(self._levels, limits, strict=True)
-                    if limit
-                ]
-                merged = found[0] if len(found) == 1 else _merged(found, width)
-                faces[part], distances[part] = merged.faces, merged.distances
-                weights[part] = merged.weights
+        for begin in range(0, len(rays), _RAYS):
+            part = slice(begin, begin + _RAYS)
+            own = starts if len(starts) == 1 else starts[part]
+            found = [
+                level.hits(own, rays[part], limit, front=sides == "front")
+                for level, limit in zip(self._levels, limits, strict=True)
+                if limit
+            ]
+            merged = found[0] if len(found) == 1 else _merged(found, width)
+            faces[part], distances[part] = merged.faces, merged.distances
+            weights[part] = merged.weights
         return MeshHits(faces=faces, distances=distances, weights=weights)
 
 
@@ -263,37 +259,6 @@ class PrimitiveCaster:
             distances=hits.distances.gather(1, finest)[:, 0],
             weights=hits.weights.gather(1, finest[..., None].expand(-1, -1, 3))[:, 0].double(),
         )
-
-
-@boundary
-def mesh_distances(
-    mesh: PrimitiveMesh | PrimitiveCaster, camera: Camera
-) -> Float[Tensor, "height width"]:
-    """Distances from the camera's centre to the first hits of the pixels' rays, float32, 0 none.
-
-    Args:
-        mesh: The mesh, or the caster of a mesh that is looked at from several cameras.
-        camera: Its pixels.
-    """
-    caster = mesh if isinstance(mesh, PrimitiveCaster) else PrimitiveCaster(mesh)
-    origin, directions = camera.rays()
-    hits = caster.first(origin, directions.reshape(-1, 3))
-    found = torch.where(hits.faces >= 0, hits.distances, 0.0)
-    return found.view(camera.height, camera.width).float()
-
-
-@boundary
-def mesh_depth(
-    mesh: PrimitiveMesh | PrimitiveCaster, camera: Camera
-) -> Float[Tensor, "height width"]:
-    """z-depth of the first hits of the pixels' rays, scene units, float32, 0 where there is none.
-
-    Args:
-        mesh: The mesh, or the caster of a mesh that is looked at from several cameras.
-        camera: Its pixels.
-    """
-    _, directions = camera.rays()
-    return (mesh_distances(mesh, camera) * axis_cosines(camera, directions)).float()
 
 
 # Which primitives enclose a point: by the solid angle that their faces fill around it.

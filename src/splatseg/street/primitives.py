@@ -10,7 +10,6 @@ from torch import Tensor
 
 from splatseg._check import check_finite, check_shape
 from splatseg.core.boundary import boundary, convert_fields
-from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError, RangeError
 from splatseg.lift.point_shapes import thin
 from splatseg.street.shapes import (
@@ -160,6 +159,7 @@ class Primitives:
             sizes=self.sizes,
         )
 
+    @boundary
     def mesh(self, shapes: ShapeAutoEncoder) -> PrimitiveMesh:
         """Their vertices in the world, without gradients.
 
@@ -168,7 +168,7 @@ class Primitives:
         """
         check_shape("codes", self.codes, (None, shapes.code_size))
         vertices = torch.zeros(len(self), VERTICES, 3)
-        with torch.no_grad(), one_torch_thread():
+        with torch.no_grad():
             for start in range(0, len(self), _DECODED):
                 part = slice(start, start + _DECODED)
                 vertices[part] = world_vertices(

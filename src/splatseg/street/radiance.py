@@ -14,7 +14,6 @@ from torch.nn import functional
 from splatseg._check import check_finite, check_shape
 from splatseg.core.boundary import boundary
 from splatseg.core.options import Count, Natural, NonNegative, Positive, options
-from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError, RangeError
 from splatseg.street.hits import MAX_HITS, Sides
 from splatseg.street.primitives import PrimitiveMesh
@@ -388,7 +387,7 @@ class RadianceModel(nn.Module):
         check_shape("mesh.vertices", mesh.vertices, (len(self.features), 3))
         opacity = torch.empty(len(mesh.vertices))
         probabilities = torch.empty(len(mesh.vertices), len(self._ids))
-        with torch.no_grad(), one_torch_thread():
+        with torch.no_grad():
             for begin in range(0, len(mesh.vertices), _VERTICES):
                 part = slice(begin, begin + _VERTICES)
                 places = mesh.vertices[part].to(self.features)
@@ -461,13 +460,3 @@ def ray_weights(
         weights.append(passed * one)
         passed = passed * (1 - one)
     return torch.stack(weights, dim=1), passed
-
-
-def composite(
-    opacity: Float[Tensor, "n hits"],
-    values: Float[Tensor, "n hits c"],
-    background: Float[Tensor, "n c"],
-) -> Float[Tensor, "n c"]:
-    """What rays show: values of samples, front to back, then the background."""
-    weights, passed = ray_weights(opacity)
-    return torch.einsum("nl,nlc->nc", weights, values) + passed[:, None] * background

@@ -12,7 +12,7 @@ from torch.nn import functional
 from splatseg._check import check_shape
 from splatseg.core import Camera
 from splatseg.core.boundary import boundary
-from splatseg.core.threads import caller_threads, one_torch_thread
+from splatseg.core.threads import caller_threads
 from splatseg.street.hits import MeshCaster, MeshHits
 from splatseg.street.primitives import PrimitiveMesh
 from splatseg.street.radiance import RadianceModel, RadianceOptions, ray_weights
@@ -210,12 +210,11 @@ def depth_from_distance(
 def in_threads(work: Callable[[int], RayValues], items: range) -> Iterator[RayValues]:
     """Do work on as many threads as torch has, each by itself with one; results in order."""
     threads = caller_threads()
-    with one_torch_thread():
-        if threads == 1 or len(items) == 1:
-            yield from map(work, items)
-            return
-        with ThreadPoolExecutor(threads) as pool:
-            yield from pool.map(work, items)
+    if threads == 1 or len(items) == 1:
+        yield from map(work, items)
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        yield from pool.map(work, items)
 
 
 def _block(

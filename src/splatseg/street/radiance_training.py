@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from splatseg.core import View
 from splatseg.core.boundary import boundary
-from splatseg.core.threads import caller_threads, one_torch_thread
+from splatseg.core.threads import caller_threads
 from splatseg.errors import InputError
 from splatseg.io.evidence import Evidence
 from splatseg.lift.training import AdamConstants, RowAdam, RowMoments
@@ -307,7 +307,6 @@ def train_radiance(
     classes = checked_ids(tuple(found))
     threads = caller_threads()
     with ExitStack() as stack:
-        stack.enter_context(one_torch_thread())
         rays = training_rays(views, evidence, classes, read=read)
         surface = Surface(mesh)
         hits = _hits(mesh, surface, rays, options)

@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Mapping
-from dataclasses import asdict, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from splatseg.core.boundary import boundary
-from splatseg.core.json_values import is_json_number, plain_object
-from splatseg.errors import FileFormatError, InputError, MissingFileError, quoted
-from splatseg.io.foreign import is_file, made_from
-from splatseg.io.json_files import json_text, parse_object
+from splatseg.errors import FileFormatError, MissingFileError
+from splatseg.io.foreign import derived_from, expect, is_file
+from splatseg.io.json_files import parse_object
+from splatseg.io.schema import structured
 from splatseg.io.tensor_table import TensorTable
-from splatseg.io.tensors import read_safetensors, read_tensors, read_torch_file, write_tensors
+from splatseg.io.tensors import read_safetensors, read_tensors, read_torch_file
 from splatseg.street.shapes import (
     MAX_LAYERS,
     PUBLISHED,
@@ -36,9 +36,9 @@ VERSION = "1"
 def load_shapes(path: Path | None = None) -> ShapeAutoEncoder:
     """An auto-encoder from a file, to be evaluated: its weights take no gradients.
 
-    Read are files of `save_shapes`, and the published checkpoint (``mesh_ae.pth`` of DNMP) as
-    ``torch.save`` wrote it, of which nothing is run; of the latter also its decoder alone, as
-    ``torch.save``, safetensors or npz.
+    Read are files of ``scripts/train_shapes``, and the published checkpoint (``mesh_ae.pth`` of
+    DNMP) as ``torch.save`` wrote it, of which nothing is run; of the latter also its decoder
+    alone, as ``torch.save``, safetensors or npz.
 
     Args:
         path: The file; None is the one that comes with the package.
@@ -51,7 +51,7 @@ def load_shapes(path: Path | None = None) -> ShapeAutoEncoder:
     if path is None and not is_file(SHIPPED):
         raise MissingFileError(
             f"{SHIPPED.name}: this installation has no weights of shapes; give the file of an "
-            "auto-encoder: mesh_ae.pth of DNMP, or one of save_shapes."
+            "auto-encoder: mesh_ae.pth of DNMP, or one of scripts/train_shapes."
         )
     file = SHIPPED if path is None else path
     if file.suffix == ".safetensors":
@@ -65,34 +65,14 @@ def load_shapes(path: Path | None = None) -> ShapeAutoEncoder:
     return shapes.eval().requires_grad_(requires_grad=False)
 
 
-@boundary
-def save_shapes(shapes: ShapeAutoEncoder, path: Path, *, facts: Mapping[str, Any]) -> None:
-    """Write an auto-encoder, matrices and offsets as float16, and the facts in the header.
-
-    `load_shapes` is the inverse, but for the rounding.
-
-    Args:
-        shapes: With encoder and decoder.
-        path: The file, ``.safetensors``.
-        facts: How it was trained, and its score: values that JSON holds.
-
-    Raises:
-        InputError: If it has no encoder, a weight is not finite or too large for float16, or the
-            facts hold something that JSON has no word for.
-        OutputError: If it cannot be written.
-    """
-    if shapes.encoder is None:
-        raise InputError("shapes: expected encoder and decoder, got a decoder alone.")
-    state = {name: _halved(name, tensor) for name, tensor in shapes.state_dict().items()}
-    content = {"config": asdict(shapes.config), "facts": plain_object("facts", facts)}
-    metadata = {"format": FORMAT, "version": VERSION, "about": json_text("facts", content)}
-    write_tensors(state, path, metadata=metadata)
-
-
 def _own(
     tensors: Mapping[str, Tensor], metadata: Mapping[str, str], path: Path
 ) -> ShapeAutoEncoder:
-    config = _config(metadata, path)
+    version = metadata.get("version")
+    expect(version == VERSION, path, f"version {VERSION} of {FORMAT}", version)
+    where = f"{path}: about"
+    about = parse_object(metadata.get("about", ""), where=where)
+    config = structured(about, _About, where=where).config
     with torch.device("meta"):
         shapes = ShapeAutoEncoder(config)
     table = TensorTable(tensors, path)
@@ -102,38 +82,10 @@ def _own(
     return with_tensors(shapes, state)
 
 
-def _config(metadata: Mapping[str, str], path: Path) -> ShapeConfig:
-    if metadata.get("format") != FORMAT or metadata.get("version") != VERSION:
-        raise FileFormatError(
-            f"{path}: expected version {VERSION} of {FORMAT}, got "
-            f"{quoted(metadata.get('version'))} of {quoted(metadata.get('format'))}; "
-            "a newer splatseg may read it."
-        )
-    where = f"{path}: about"
-    content = parse_object(metadata.get("about", ""), where=where)
-    config, facts = (content.get(key) for key in ("config", "facts"))
-    names = {field.name for field in fields(ShapeConfig)}
-    if not isinstance(config, dict) or set(config) != names or not isinstance(facts, dict):
-        raise FileFormatError(
-            f"{where}: expected facts and a config of {', '.join(sorted(names))}, "
-            f"got {quoted(content)}."
-        )
-    for name, value in config.items():
-        for number in value if isinstance(value, list) else [value]:
-            if not is_json_number(number):
-                raise FileFormatError(f"{where}: {name}: expected numbers, got {quoted(value)}.")
-    with made_from(where):
-        return ShapeConfig(**cast("dict[str, Any]", config))
-
-
-def _halved(name: str, tensor: Tensor) -> Tensor:
-    half = tensor.half()
-    if not bool(torch.isfinite(half).all()):
-        raise InputError(
-            f"shapes: {name}: expected weights that float16 holds, "
-            f"got {float(tensor.abs().max()):g}."
-        )
-    return half
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _About:
+    config: ShapeConfig
+    facts: dict[str, Any]
 
 
 # The published auto-encoder of DNMP, by the names and shapes of its tensors.
@@ -169,7 +121,7 @@ def published_shapes(content: object, path: Path) -> ShapeAutoEncoder:
         )
     tables = {key: TensorTable(tensors, path) for key, tensors in parts.items()}
     widths = {key: _widths(table) for key, table in tables.items()}
-    with made_from(path):
+    with derived_from(path):
         config = ShapeConfig(
             code_size=tables[_DECODER].matrix_shape(_FIRST)[1],
             decoder_widths=widths[_DECODER],

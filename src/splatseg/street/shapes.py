@@ -225,22 +225,6 @@ class ShapeAutoEncoder(nn.Module):
         return self.vertices + offsets.unflatten(1, (VERTICES, 3))
 
 
-@boundary
-def new_shapes(config: ShapeConfig, *, seed: int) -> ShapeAutoEncoder:
-    """An untrained auto-encoder; the same seed gives the same weights.
-
-    PyTorch's own initial values, but for the last layer of the decoder, which begins so small that
-    every code is a near sphere.
-    """
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        shapes = ShapeAutoEncoder(config)
-    with torch.no_grad():
-        for parameter in shapes.decoder.layers[-1].parameters():
-            parameter *= 0.1
-    return shapes
-
-
 def with_tensors(shapes: ShapeAutoEncoder, state: Mapping[str, Tensor]) -> ShapeAutoEncoder:
     """An auto-encoder that was made without memory (on ``meta``), with its tensors."""
     shapes.load_state_dict(dict(state), strict=True, assign=True)

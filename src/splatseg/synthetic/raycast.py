@@ -7,7 +7,6 @@ import torch
 from jaxtyping import Float, Int, Int64, UInt8
 from torch import Tensor
 
-from splatseg._check import check_shape
 from splatseg.core import Camera
 from splatseg.core.boundary import boundary
 from splatseg.core.evidence import UNLABELLED
@@ -82,8 +81,6 @@ def cast(
         The distance along each ray in metres (inf where nothing is met), and the index of the
         solid in ``scene.primitives`` (-1).
     """
-    check_shape("origin", origin, (3,))
-    check_shape("directions", directions, (None, 3))
     tables = _tables(scene)
     count = len(directions)
     distance = directions.new_full((count,), torch.inf)

@@ -1,45 +1,26 @@
 """What generated scenes are made of: solids and where rays meet them, objects, classes, the sun."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal, get_args
 
 import torch
 from jaxtyping import Bool, Float
+from msgspec import Meta
 from torch import Tensor
 
-from splatseg._check import check_choice, check_range
 from splatseg.core import ClassTable
 from splatseg.core.boundary import convert_fields
-from splatseg.errors import InputError, RangeError
+from splatseg.core.options import Count, Positive, Share
+from splatseg.errors import InputError
 
 ShapeName = Literal["box", "cylinder", "sphere", "plane"]
 TextureName = Literal[
-    "plain",
-    "wood",
-    "planks",
-    "stripes",
-    "checker",
-    "weave",
-    "dots",
-    "painting",
-    "spines",
-    "sky",
-]
+    "plain", "wood", "planks", "stripes", "checker", "weave", "dots", "painting", "spines", "sky"
+]  # fmt: skip
 Vector = tuple[float, float, float]
 
-SHAPES: tuple[ShapeName, ...] = ("box", "cylinder", "sphere", "plane")
-TEXTURES: tuple[TextureName, ...] = (
-    "plain",
-    "wood",
-    "planks",
-    "stripes",
-    "checker",
-    "weave",
-    "dots",
-    "painting",
-    "spines",
-    "sky",
-)
+SHAPES: tuple[ShapeName, ...] = get_args(ShapeName)
+TEXTURES: tuple[TextureName, ...] = get_args(TextureName)
 _TINY = 1e-12
 _GREY: Vector = (0.7, 0.7, 0.7)
 
@@ -53,7 +34,7 @@ class Texture:
     palette: tuple[Vector, Vector, Vector] = (_GREY, _GREY, _GREY)
     """Three sRGB colours in [0, 1]; the pattern's value 0, 1 or 2 chooses among them."""
 
-    scale: float = 0.1
+    scale: Positive = 0.1
     """Size of the pattern's features in metres."""
 
     glow: float = 0.0
@@ -62,9 +43,6 @@ class Texture:
 
     def __post_init__(self) -> None:
         convert_fields(self)
-        check_choice("kind", self.kind, TEXTURES)
-        if self.scale <= 0:
-            raise RangeError(f"scale: expected a positive size in metres, got {self.scale:g}.")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,10 +54,10 @@ class Primitive:
     centre: Vector
     """Middle of the solid in the world, metres."""
 
-    half_size: Vector
+    half_size: tuple[Positive, Positive, Positive]
     """Half of its extent along its own x, y, z in metres. A plane ignores the third."""
 
-    instance: int
+    instance: Count
     """Id of the object it belongs to, from 1."""
 
     yaw: float = 0.0
@@ -88,19 +66,13 @@ class Primitive:
     tilt: float = 0.0
     """Turn about the solid's own x axis, before `yaw`, radians."""
 
-    taper: float = 1.0
+    taper: Share = 1.0
     """Radius of a cylinder's top as a fraction of its bottom's, in [0, 1]."""
 
     texture: Texture = Texture()
 
     def __post_init__(self) -> None:
         convert_fields(self)
-        check_choice("shape", self.shape, SHAPES)
-        check_range("taper", self.taper, 0.0, 1.0)
-        if min(self.half_size) <= 0:
-            raise RangeError(f"half_size: expected positive lengths, got {self.half_size}.")
-        if self.instance < 1:
-            raise RangeError(f"instance: expected an id from 1 on, got {self.instance}.")
 
     @property
     def rotation(self) -> Float[Tensor, "3 3"]:
@@ -293,12 +265,11 @@ class SyntheticScene:
     drive: tuple[Vector, ...] = ()
     """Corners of a line on the ground that a vehicle with cameras follows; none in a room."""
 
-    ambient: float = 1.0
+    ambient: Annotated[float, Meta(ge=0, le=100)] = 1.0
     """Brightness of the light that comes from everywhere; 1 suits a room with a window."""
 
     def __post_init__(self) -> None:
         convert_fields(self)
-        check_range("ambient", self.ambient, 0.0, 100.0)
         ids = [item.id for item in self.objects]
         if len(set(ids)) != len(ids):
             raise InputError(f"objects: expected distinct ids, got {sorted(ids)}.")

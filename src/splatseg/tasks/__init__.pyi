@@ -26,13 +26,13 @@ from .photographs import Examination as Examination
 from .photographs import MakeSceneOptions as MakeSceneOptions
 from .photographs import examine_capture as examine_capture
 from .pictures import check_selection_file as check_selection_file
-from .pictures import draw_answers as draw_answers
 from .pictures import draw_heat as draw_heat
+from .pictures import draw_query_result as draw_query_result
 from .pictures import draw_selection as draw_selection
 from .pictures import save_selected_splats as save_selected_splats
 from .pictures import write_query_report as write_query_report
-from .query import Answers as Answers
 from .query import Found as Found
+from .query import QueryResult as QueryResult
 from .query import QuerySession as QuerySession
 from .query import query as query
 from .render import Rendering as Rendering
@@ -74,8 +74,8 @@ from .street_inputs import StreetOptions as StreetOptions
 from .street_report import LabelledScans as LabelledScans
 from .street_report import report_street as report_street
 from .street_scene import StreetScene as StreetScene
-from .street_scene import made_street_field as made_street_field
 from .street_scene import make_street_field as make_street_field
+from .street_scene import street_field_of_scene as street_field_of_scene
 from .street_scene import street_scene as street_scene
 from .work import SILENT as SILENT
 from .work import Observer as Observer

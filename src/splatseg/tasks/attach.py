@@ -57,14 +57,15 @@ class AttachLayersOptions:
     is written."""
 
     strict: bool = False
-    """Refuse files with Gaussians that cannot be rendered; see `read_splats`."""
+    """Refuse files with Gaussians that cannot be rendered (NaN, infinite). Without it they are left
+    out and counted, as long as one remains."""
 
     linear: tuple[Values, ...] = ()
     """Values of PLY files that are stored as they are, where 3DGS stores logs and logits: scales,
     opacities."""
 
     overwrite: bool = False
-    """Replace layers of the same name in a scene folder that the edited file is."""
+    """Replace what an earlier run wrote under the same name."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -33,7 +33,7 @@ class CheckpointOptions:
     that was never stopped."""
 
     overwrite: bool = False
-    """Begin again what was stopped."""
+    """Replace what an earlier run wrote under the same name."""
 
     checkpoint_every: Positive = 60.0
     """Seconds between two checkpoints, from which `resume` continues."""

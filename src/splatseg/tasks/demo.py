@@ -3,9 +3,9 @@
 import shlex
 import shutil
 import time
-from collections.abc import Generator
+from collections.abc import Generator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,29 +15,30 @@ from splatseg.core import Scene
 from splatseg.core.boundary import boundary
 from splatseg.core.options import options as options_class
 from splatseg.errors import InputError
+from splatseg.evaluate import Confusion, SemanticScore, semantic_score
 from splatseg.fit import FitOptions
 from splatseg.io.atomic import is_vacant
+from splatseg.io.evidence import open_evidence
 from splatseg.io.json_files import read_json, write_json
 from splatseg.io.scene import load_scene, save_scene_layer
 from splatseg.io.scene_folder import check_unlocked, work_on_scene
 from splatseg.render import BackendName
-from splatseg.report.demo_report import DemoFigures, machine_score, write_report
 from splatseg.report.fit_report import scored_of
 from splatseg.synthetic import cameras, room, write_capture
 from splatseg.tasks.evaluate import EvaluationOptions, Metric, evaluate_scene
-from splatseg.tasks.export import export_layer, export_scene, report_layer
+from splatseg.tasks.export import Exported, export_layer, export_scene, report_layer
 from splatseg.tasks.export_labels import ExportOptions
 from splatseg.tasks.make_scene import MadeScene, fit_capture
 from splatseg.tasks.render import RenderingOptions, render_views
 from splatseg.tasks.see import see
-from splatseg.tasks.segment import Segmentation, SegmentOptions, segment
+from splatseg.tasks.segment import SegmentOptions, segment
 from splatseg.tasks.work import SILENT, Observer, check_parent
 
 _RECORD = "demo.json"
 _MADE_BY = "splatseg demo"
 # Everything that the demo writes besides its record; a second run removes these and no more.
 _FOLDERS = ("capture", "scene", "render")
-_FILES = ("labelled.ply", "labelled.json", "contact_sheet.png", "report.html")
+_FILES = ("labelled.ply", "labelled.json")
 _POINTS = 15_000
 _LAYER = "semantic"
 _EVIDENCE = "labels_semantic"
@@ -73,9 +74,19 @@ class Demo:
     """What a demo left in its folder, and what it measured."""
 
     folder: Path
-    figures: DemoFigures
+    came: SemanticScore
+    """Of the machine's labels as they came, in train views."""
+
+    figures: Mapping[tuple[str, str], Mapping[str, Any]]
+    """What `evaluate_scene` gave, by layer (semantic, objects) and split."""
+
     record: dict[str, Any]
     """What its demo.json holds: scores, seconds by step, commands that do the same."""
+
+    @property
+    def reports(self) -> tuple[Path, ...]:
+        """The pages of its layers."""
+        return tuple(self.folder / f"scene/reports/{layer}.html" for layer in (_LAYER, _OBJECTS))
 
 
 @boundary
@@ -109,30 +120,34 @@ def _made(
     folder: Path, options: DemoOptions, started: float, backend: BackendName, observer: Observer
 ) -> Demo:
     _prepare(folder, observer)
-    steps: list[tuple[str, float]] = []
     observer.info("Generating a room with photographs, truth and machine labels")
     capture = folder / "capture"
     _photograph(capture, options, observer)
-    steps.append(("generate", time.monotonic() - started))
-    job = _MainJob(folder=folder, options=options, backend=backend, observer=observer, steps=steps)
+    job = _MainJob(folder, options, backend, observer)
+    job.steps["generate"] = time.monotonic() - started
     job.run()
-    begin = time.monotonic()
-    figures = DemoFigures(
-        came=machine_score(capture, _EVIDENCE),
-        train=job.figures[_LAYER, "train"],
-        test=job.figures[_LAYER, "test"],
-        objects=job.figures[_OBJECTS, "test"],
-        steps=tuple(steps),
-        commands=tuple(job.lines),
-        started=started,
-    )
-    write_report(
-        figures, folder, seed=options.seed, layer=_LAYER, evidence=_EVIDENCE, objects=_OBJECTS
-    )
-    steps.append(("report", time.monotonic() - begin))
-    record = _record(figures, steps, time.monotonic() - started)
+    came = _machine_score(capture)
+    record = {
+        "made_by": _MADE_BY,
+        "finished": True,
+        "psnr_test": job.figures[_LAYER, "test"]["PSNR"],
+        "miou_labels_as_they_came_train": came.miou,
+        "miou_lifted_train": job.figures[_LAYER, "train"]["mIoU"],
+        "miou_lifted_test": job.figures[_LAYER, "test"]["mIoU"],
+        "miou_objects_test": job.figures[_OBJECTS, "test"]["mIoU"],
+        "seconds": {name: round(seconds, 2) for name, seconds in job.steps.items()},
+        "seconds_total": round(time.monotonic() - started, 2),
+        "commands": job.lines,
+    }
     write_json(record, folder / _RECORD)
-    return Demo(folder=folder, figures=figures, record=record)
+    return Demo(folder=folder, came=came, figures=job.figures, record=record)
+
+
+def _machine_score(capture: Path) -> SemanticScore:
+    """Of the recorded labels in the views that have them, pooled."""
+    labels, truth = open_evidence(capture / _EVIDENCE), open_evidence(capture / "semantic")
+    pairs = ((labels.label_map(name).ids, truth.label_map(name).ids) for name in labels.view_names)
+    return semantic_score(sum((Confusion.of(*pair) for pair in pairs), Confusion.none()))
 
 
 def _photograph(capture: Path, options: DemoOptions, observer: Observer) -> None:
@@ -148,24 +163,21 @@ def _photograph(capture: Path, options: DemoOptions, observer: Observer) -> None
         write_capture(scene, capture, views=views, points=_POINTS, seed=options.seed, progress=step)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
 class _MainJob:
     """The steps of the main job; each tells the command that does the same from the shell."""
 
-    folder: Path
-    options: DemoOptions
-    backend: BackendName
-    observer: Observer
-    steps: list[tuple[str, float]]
-    """Names and seconds."""
-
-    lines: list[str] = field(default_factory=list[str])
-    """The commands."""
-
-    figures: dict[tuple[str, str], dict[str, Any]] = field(
-        default_factory=dict[tuple[str, str], dict[str, Any]]
-    )
-    """Scores by layer and split."""
+    def __init__(
+        self, folder: Path, options: DemoOptions, backend: BackendName, observer: Observer
+    ) -> None:
+        self.folder, self.options = folder, options
+        self.backend: BackendName = backend
+        self.observer = observer
+        self.steps: dict[str, float] = {}
+        """Seconds by step."""
+        self.lines: list[str] = []
+        """The commands."""
+        self.figures: dict[tuple[str, str], dict[str, Any]] = {}
+        """Scores by layer and split."""
 
     def run(self) -> None:
         """Do all steps."""
@@ -174,26 +186,11 @@ class _MainJob:
         with self._step("fit", capture, "-o", root, *self._fit_words()):
             self._fit(capture, root)
         scene = load_scene(root)
-        with self._step(
-            *("segment", root, "--method", "uplift"),
-            *("--evidence", _EVIDENCE, "--layer", _LAYER),
-            what=_LAYER,
-        ):
-            self._segment(scene, "uplift", SegmentOptions(evidence=_EVIDENCE, layer=_LAYER))
+        truth = {_LAYER: capture / "semantic", _OBJECTS: capture / "instance"}
+        self._segment(scene, "uplift", _EVIDENCE, _LAYER, truth[_LAYER])
         with self._step("see", root, "--model", "classical", "--evidence", _MASKS):
             see(scene, "classical", _MASKS, observer=observer)
-        with self._step(
-            *("segment", root, "--method", "associate", "--evidence", _MASKS),
-            *("--layer", _OBJECTS, "--export", "--report"),
-            what=_OBJECTS,
-        ):
-            made = self._segment(
-                scene, "associate", SegmentOptions(evidence=_MASKS, layer=_OBJECTS)
-            )
-            files, _ = export_layer(
-                scene, root, _OBJECTS, made.layer, backend=backend, observer=observer
-            )
-            report_layer(scene, root, made, exported=files, command=self.lines[-1], backend=backend)
+        self._segment(scene, "associate", _MASKS, _OBJECTS, truth[_OBJECTS])
         what = ("rgb", "depth", _LAYER, _OBJECTS)
         with self._step("render", root, "--what", ",".join(what), "-o", folder / "render"):
             render_views(
@@ -204,8 +201,8 @@ class _MainJob:
                 observer=observer,
             )
         for split in ("train", "test"):
-            self._evaluate(scene, _LAYER, split, capture / "semantic", "semantic")
-        self._evaluate(scene, _OBJECTS, "test", capture / "instance", "instances")
+            self._evaluate(scene, _LAYER, split, truth[_LAYER], "semantic")
+        self._evaluate(scene, _OBJECTS, "test", truth[_OBJECTS], "instances")
         labelled = folder / "labelled.ply"
         with self._step("export", root, "--layer", _LAYER, "--instances", _OBJECTS, "-o", labelled):
             export_scene(scene, labelled, options=ExportOptions(layer=_LAYER, instances=_OBJECTS))
@@ -226,10 +223,32 @@ class _MainJob:
             raise KeyboardInterrupt
         self.observer.info(_fitted(made))
 
-    def _segment(self, scene: Scene, method: str, options: SegmentOptions) -> Segmentation:
-        made = segment(scene, method, options=options, backend=self.backend, observer=self.observer)
-        save_scene_layer(made.layer, self.folder / "scene", made.name)
-        return made
+    def _segment(self, scene: Scene, method: str, evidence: str, layer: str, truth: Path) -> None:
+        backend, observer = self.backend, self.observer
+        root = self.folder / "scene"
+        with self._step(
+            *("segment", root, "--method", method, "--evidence", evidence, "--layer", layer),
+            *(("--export",) if layer == _OBJECTS else ()),
+            *("--report", "--truth", truth),
+            what=layer,
+        ):
+            options = SegmentOptions(evidence=evidence, layer=layer)
+            made = segment(scene, method, options=options, backend=backend, observer=observer)
+            save_scene_layer(made.layer, root, made.name)
+            files: tuple[Exported, ...] = ()
+            if layer == _OBJECTS:
+                files, _ = export_layer(
+                    scene, root, layer, made.layer, backend=backend, observer=observer
+                )
+            report_layer(
+                scene,
+                root,
+                made,
+                truth=open_evidence(truth),
+                exported=files,
+                command=self.lines[-1],
+                backend=backend,
+            )
 
     def _evaluate(self, scene: Scene, layer: str, split: str, truth: Path, metric: Metric) -> None:
         with self._step(
@@ -257,8 +276,7 @@ class _MainJob:
         self.observer.info(f"$ {line}")
         begin = time.monotonic()
         yield
-        seconds = time.monotonic() - begin
-        self.steps.append((f"{name} {what}".strip(), seconds))
+        self.steps[f"{name} {what}".strip()] = time.monotonic() - begin
 
     def _minutes(self) -> float | None:
         options = self.options
@@ -310,18 +328,3 @@ def _prepare(folder: Path, observer: Observer) -> None:
             shutil.rmtree(folder / name)
     for name in _FILES:
         (folder / name).unlink(missing_ok=True)
-
-
-def _record(figures: DemoFigures, steps: list[tuple[str, float]], total: float) -> dict[str, Any]:
-    return {
-        "made_by": _MADE_BY,
-        "finished": True,
-        "psnr_test": figures.test["PSNR"],
-        "miou_labels_as_they_came_train": figures.came.miou,
-        "miou_lifted_train": figures.train["mIoU"],
-        "miou_lifted_test": figures.test["mIoU"],
-        "miou_objects_test": figures.objects["mIoU"],
-        "seconds": {name: round(seconds, 2) for name, seconds in steps},
-        "seconds_total": round(total, 2),
-        "commands": list(figures.commands),
-    }

@@ -15,12 +15,12 @@ from splatseg.core.boundary import boundary
 from splatseg.edit import Document, Operation, apply, load_document, prepare, save_document, undo
 from splatseg.edit.document import BASE, HISTORY
 from splatseg.errors import InputError, MissingFileError
-from splatseg.io.images import image_camera, save_png
+from splatseg.io.images import image_camera
 from splatseg.io.scene_folder import is_scene
 from splatseg.lift import CutOptions
 from splatseg.render import BackendName, render
 from splatseg.report.html import Figure, Report
-from splatseg.report.images import Gallery, GalleryImage, contact_sheet
+from splatseg.report.images import Gallery, GalleryImage
 from splatseg.tasks.edit_operations import EditOptions, measured_change, operations_of, where_of
 from splatseg.tasks.work import REPORTS_FOLDER, SILENT, Observer, Work, check_new_folder, write_page
 
@@ -84,7 +84,7 @@ def write_edit_report(
     counts: tuple[int, int],
     operations: Sequence[Mapping[str, Any]],
 ) -> None:
-    """Write edit.html, edit.png and edit.json in a folder of reports.
+    """Write edit.html and edit.json in a folder of reports.
 
     Args:
         folder: The reports of the new scene; made where it is not there.
@@ -100,7 +100,6 @@ def write_edit_report(
     )
     summary = " ".join(map(edit_sentence, operations))
     page = Report(title="Edit", summary=summary, figures=figures, blocks=(pictures,))
-    save_png(contact_sheet(pictures, cell_width=480), folder / "edit.png")
     record = {
         "before": before,
         "after": after,

@@ -20,7 +20,7 @@ from splatseg.lift import CutOptions, GaussianField
 from splatseg.methods import keeps_boundaries
 from splatseg.render import BackendName, render
 from splatseg.selection import Where, ids_named, layer_called, select_where
-from splatseg.tasks.work import Observer, photographed, views_that_made
+from splatseg.tasks.work import Observer, photographed, source_views
 
 Triple = tuple[float, float, float]
 
@@ -132,8 +132,8 @@ class EditOptions:
     them."""
 
     pictures: Natural = 3
-    """Number of views drawn before and after, those that change most, for reports/edit.html and
-    edit.png of the new scene. 0 draws none, and does not measure the change by the cut."""
+    """Number of views drawn before and after, those that change most, for reports/edit.html of the
+    new scene. 0 draws none, and does not measure the change by the cut."""
 
     def __post_init__(self) -> None:
         action = self._action()
@@ -236,7 +236,7 @@ def _mask_cut(document: Document, where: Where, named: str | None, cut: CutOptio
     evidence = open_evidence(folder, zero_is_class=zero_is_class)
     if evidence.kind not in ("labels", "tracked"):
         raise InputError(f"cut: masks needs label maps, {name} is {evidence.kind}.")
-    views = tuple(view.name for view in views_that_made(document.scene, info, evidence))
+    views = tuple(view.name for view in source_views(document.scene, info, evidence))
     if not views:
         raise InputError(f"cut: masks: {name} has no label map of a view that may be used.")
     return CutBy(by="masks", evidence=name, zero_is_class=zero_is_class, views=views, options=cut)

@@ -81,7 +81,7 @@ class ExportOptions:
     training cameras."""
 
     frames: Count = 360
-    """Number of views of split path."""
+    """Number of views of a path."""
 
 
 _SELECTED = 1

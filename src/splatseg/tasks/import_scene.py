@@ -40,14 +40,16 @@ class ImportOptions:
     cameras."""
 
     format: str = "auto"
-    """Layout of the capture: auto, or one of `io.captures.FORMATS`."""
+    """Layout of the capture: auto, nerfstudio, blender, colmap, llff, idr, replica, scannet,
+    scannetpp, kitti360 or waymo. auto takes the first of these that is found."""
 
     as_is: bool = False
     """Do not compare the file with the photographs, and do not move it."""
 
     strict: bool = False
-    """Refuse a file with Gaussians that cannot be rendered, and a capture that lists a photograph
-    which is not there; see `read_splats` and `read_capture`."""
+    """Refuse a splat file with Gaussians that cannot be rendered (NaN, infinite), and a capture
+    with photographs that cannot be used. Without it they are left out and counted or named, as long
+    as a Gaussian and half of the photographs remain."""
 
     linear: tuple[Values, ...] = ()
     """Values of a PLY file that are stored as they are, where 3DGS stores logs and logits: scales,

@@ -15,6 +15,7 @@ from splatseg.evaluate.photographs import MaskUse
 from splatseg.fit import (
     EXPOSURES,
     FitOptions,
+    FitProgress,
     FitResult,
     exposures_record,
     fit,
@@ -45,6 +46,7 @@ from splatseg.tasks.work import (
     REPORTS_FOLDER,
     SILENT,
     Observer,
+    Step,
     scene_of_capture,
     versions,
     write_page,
@@ -252,12 +254,12 @@ def _fitted(
 ) -> tuple[FitResult, bool]:
     """Fit and write the scene. Tells whether it was asked to stop, while it wrote too."""
     with deferred_interrupts() as interrupts:
-        with observer.fit_stage() as step:
+        with observer.stage("fit") as step:
             result = fit(
                 capture,
                 options=fit_options,
                 backend=backend,
-                progress=step,
+                progress=FitSteps(step),
                 checkpoints=checkpoints,
             )
         provenance = _provenance(record, fit_options, backend, result)
@@ -266,6 +268,35 @@ def _fitted(
         )
         save_scene(scene, folder)
     return result, interrupts.requested or result.interrupted
+
+
+# Weight of the newest view in the figures that are told; views differ much.
+_SMOOTHING = 0.02
+
+
+class FitSteps:
+    """Tells of the steps of a fit, with loss and PSNR smoothed over many views.
+
+    Args:
+        step: Is told.
+    """
+
+    def __init__(self, step: Step) -> None:
+        self._step = step
+        self._smoothed: tuple[float, float] | None = None
+
+    def __call__(self, now: FitProgress) -> None:
+        """Of one step."""
+        loss, psnr = self._smoothed or (now.loss, now.psnr)
+        loss += _SMOOTHING * (now.loss - loss)
+        psnr += _SMOOTHING * (now.psnr - psnr)
+        self._smoothed = loss, psnr
+        self._step(
+            round(1000 * now.progress),
+            1000,
+            f"step {now.step}, loss {loss:.4f}, PSNR {psnr:.2f}, {now.count} Gaussians, "
+            f"{now.step / max(now.seconds, 1e-9):.1f} it/s",
+        )
 
 
 def _beginning(capture: Capture, options: FitOptions) -> str:

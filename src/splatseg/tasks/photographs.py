@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -14,7 +15,7 @@ from splatseg.core.options import Count
 from splatseg.core.options import options as options_class
 from splatseg.errors import InputError, MissingFileError
 from splatseg.fit import DepthPoints, scan_depths
-from splatseg.io.atomic import check_utf8, is_vacant
+from splatseg.io.atomic import check_utf8
 from splatseg.io.captures import find_formats, read_capture
 from splatseg.io.evidence import DepthEvidence, find_evidence, open_evidence, save_depth_map
 from splatseg.io.pointmaps import HEADER_FILE, RecordedPointmaps, holds_pointmaps, open_pointmaps
@@ -22,6 +23,7 @@ from splatseg.io.scene_folder import POSES_FOLDER
 from splatseg.models import model_names
 from splatseg.pose import (
     PoseOptions,
+    PoseProgress,
     PoseReport,
     PoseResult,
     holds_photographs,
@@ -44,7 +46,7 @@ from splatseg.pose.pointmaps import (
 from splatseg.tasks.checkpoints import CheckpointOptions
 from splatseg.tasks.moving import MovingClock
 from splatseg.tasks.see import model_of, name_of
-from splatseg.tasks.work import Observer, check_parent
+from splatseg.tasks.work import Observer, Step, check_new_folder
 
 Poses = Literal["auto", "given", "sfm", "pointmaps"]
 """Where cameras come from."""
@@ -55,10 +57,13 @@ class MakeSceneOptions(CheckpointOptions):
     """How photographs are read, where cameras come from, and how a stopped fit goes on."""
 
     format: str = "auto"
-    """Layout of the capture: auto, or one of `io.captures.FORMATS`."""
+    """Layout of the capture: auto, nerfstudio, blender, colmap, llff, idr, replica, scannet,
+    scannetpp, kitti360 or waymo. auto takes the first of these that is found."""
 
     strict: bool = False
-    """Refuse a capture that lists a photograph which would be left out; see `read_capture`."""
+    """Refuse a capture with photographs that are missing, unreadable, of another shape than their
+    intrinsics or mask or with an impossible pose, or with start points that are not finite. Without
+    it they are left out and named, as long as half of the photographs remain."""
 
     poses: Poses = "auto"
     """Source of the cameras. given: the capture. sfm: structure from motion on the photographs,
@@ -138,9 +143,7 @@ def examine_capture(
     if options.max_views < 2:
         raise InputError(f"max_views: expected at least 2, got {options.max_views}.")
     if fix is not None:
-        if fix.exists() and not (fix.is_dir() and is_vacant(fix)):
-            raise InputError(f"{fix}: expected a new or empty folder to write to.")
-        check_parent(fix)
+        check_new_folder(fix)
     read = read_for_doctor(data, format=format)
     diagnosis = diagnose(read.capture, options=options, found=read.faults, declared=read.declared)
     if fix is None or diagnosis.corrected is None:
@@ -187,11 +190,18 @@ def capture_of(
         )
     check_utf8(data)
     how = PoseOptions(seed=seed, frames=options.frames)
-    with observer.pose_stage() as step:
-        result = recover_poses(data, folder=scene / POSES_FOLDER, options=how, progress=step)
+    with observer.stage("poses") as step:
+        result = recover_poses(
+            data, folder=scene / POSES_FOLDER, options=how, progress=partial(_told, step)
+        )
     for line in _sentences(data, scene / POSES_FOLDER, result):
         observer.info(line)
     return result.capture, result.report
+
+
+def _told(step: Step, now: PoseProgress) -> None:
+    """Stages take differently long: their names say more than an estimate of the whole."""
+    step(now.done, 0, f"{now.stage} {now.done}/{now.total}" if now.total else now.stage)
 
 
 def _without_poses(data: Path, format: str, poses: Poses) -> bool:
@@ -280,8 +290,10 @@ def capture_of_pointmaps(
     if max_points is not None:
         options = PointmapOptions(seed=seed, max_points=max_points)
     folder = scene / POSES_FOLDER
-    with observer.pose_stage() as step:
-        result = recover_from_pointmaps(data, source, folder=folder, options=options, progress=step)
+    with observer.stage("poses") as step:
+        result = recover_from_pointmaps(
+            data, source, folder=folder, options=options, progress=partial(_told, step)
+        )
     for line in _pointmap_sentences(data, folder, result):
         observer.info(line)
     return result.capture, result.report

@@ -31,7 +31,7 @@ from splatseg.report.images import (
 )
 from splatseg.report.objects import sightings
 from splatseg.report.words import counted
-from splatseg.tasks.query import Answers, Found, answers_record
+from splatseg.tasks.query import Found, QueryResult, query_record
 from splatseg.tasks.render import check_film, write_film
 from splatseg.tasks.see import shown_image
 from splatseg.tasks.work import REPORTS_FOLDER, write_page
@@ -147,8 +147,8 @@ _HEAT = 0.65
 
 
 @boundary
-def draw_answers(
-    answers: Answers,
+def draw_query_result(
+    answers: QueryResult,
     scene: Scene,
     folder: Path,
     *,
@@ -184,7 +184,7 @@ def draw_answers(
 
 @boundary
 def draw_heat(
-    answers: Answers,
+    answers: QueryResult,
     scene: Scene,
     views: Sequence[View],
     folder: Path,
@@ -227,7 +227,7 @@ def draw_heat(
     return tuple(files)
 
 
-def heat_of(answers: Answers, prepared: PreparedView) -> Float[Tensor, "height width words"]:
+def heat_of(answers: QueryResult, prepared: PreparedView) -> Float[Tensor, "height width words"]:
     """The probability of each word over a view, rendered through the Gaussians."""
     with torch.no_grad():
         return prepared.render(answers.probabilities.contiguous()).image.cpu()
@@ -297,7 +297,7 @@ def _shown(view: View, means: Tensor) -> float:
 
 @boundary
 def write_query_report(
-    answers: Answers,
+    answers: QueryResult,
     scene: Scene,
     root: Path,
     *,
@@ -347,10 +347,10 @@ def write_query_report(
         },
     )
     path = scene_path(root, REPORTS_FOLDER, "query.html")
-    return write_page(page, path, record=answers_record(answers))
+    return write_page(page, path, record=query_record(answers))
 
 
-def _summary(answers: Answers) -> str:
+def _summary(answers: QueryResult) -> str:
     """What was found, in a sentence."""
     here = [
         f"{word}: {counted(len(found), 'thing')}"
@@ -365,7 +365,7 @@ def _summary(answers: Answers) -> str:
     )
 
 
-def _words(answers: Answers) -> Table:
+def _words(answers: QueryResult) -> Table:
     """Every word, also those that nothing answers to."""
     return Table(
         title="Words",
@@ -384,7 +384,7 @@ def _words(answers: Answers) -> Table:
 
 
 def _where(
-    answers: Answers,
+    answers: QueryResult,
     scene: Scene,
     views: Sequence[View],
     words: Sequence[str],
@@ -408,7 +408,7 @@ def _where(
 
 
 def _things(
-    answers: Answers,
+    answers: QueryResult,
     scene: Scene,
     views: Sequence[View],
     word: str,

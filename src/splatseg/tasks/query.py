@@ -13,8 +13,8 @@ from splatseg.core import UNLABELLED, Labels, Layer, LayerInfo, Scene, Selection
 from splatseg.core.boundary import boundary
 from splatseg.core.models import TextFeatures
 from splatseg.errors import InputError
-from splatseg.lift.phrases import ThingLooks, answer_phrases, thing_looks
-from splatseg.lift.words import WordAnswers, WordIndex
+from splatseg.lift.phrases import ThingLooks, match_phrases, thing_looks
+from splatseg.lift.words import WordIndex, WordMatches
 from splatseg.methods.voxels.words import VoxelWords
 from splatseg.render import BackendName
 from splatseg.selection import components
@@ -33,7 +33,7 @@ class Found:
     """A thing that answers to a word."""
 
     thing: int
-    """Its number, for `Answers.of_thing`; the same in all answers of one session where objects
+    """Its number, for `QueryResult.of_thing`; the same in all answers of one session where objects
     answer."""
 
     probability: float
@@ -53,7 +53,7 @@ class Found:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Answers:
+class QueryResult:
     """What a scene answers to words; of Gaussians it is worked out when it is asked for."""
 
     words: tuple[str, ...]
@@ -65,7 +65,7 @@ class Answers:
     surest: Mapping[str, float]
     """The largest probability of anything by word, also where that is not enough to answer."""
 
-    vectors: WordAnswers
+    vectors: WordMatches
     """What the distinct vectors of the layer answer."""
 
     index: WordIndex | VoxelWords
@@ -158,11 +158,11 @@ class Answers:
             options={**asdict(self.options), "from_layer": self.layer},
             names=dict(enumerate(self.words, start=1)),
             versions=versions("splatseg"),
-            details=answers_record(self),
+            details=query_record(self),
         )
 
 
-def answers_record(answers: Answers) -> dict[str, Any]:
+def query_record(answers: QueryResult) -> dict[str, Any]:
     """What was found, as values that JSON holds."""
     return {
         "words": list(answers.words),
@@ -237,7 +237,7 @@ class QuerySession:
         return self._source.made_layers
 
     @boundary
-    def ask(self, words: Sequence[str]) -> Answers:
+    def ask(self, words: Sequence[str]) -> QueryResult:
         """Which things answer to words, and how surely.
 
         Args:
@@ -251,7 +251,7 @@ class QuerySession:
             if asked.words.count(word) > 1:
                 raise InputError(f"words: expected distinct words, got {word!r} more than once.")
         pieces = None if self._places is not None else self._pieces(asked)
-        return Answers(
+        return QueryResult(
             words=asked.words,
             found={
                 word: self._found(asked, column, pieces) for column, word in enumerate(asked.words)
@@ -268,7 +268,7 @@ class QuerySession:
             pieces=pieces,
         )
 
-    def _in_parts(self, asked: WordAnswers) -> WordAnswers:
+    def _in_parts(self, asked: WordMatches) -> WordMatches:
         """Phrases asked by their parts, where each vector is a thing."""
         index = self._index
         if (
@@ -281,7 +281,7 @@ class QuerySession:
         def of_word(word: str) -> Tensor:
             return index.ask([word]).probabilities[:, 0]
 
-        _, probabilities = answer_phrases(asked, lambda: self._looks, index.vocabulary, of_word)
+        _, probabilities = match_phrases(asked, lambda: self._looks, index.vocabulary, of_word)
         return replace(asked, probabilities=probabilities)
 
     @cached_property
@@ -300,7 +300,7 @@ class QuerySession:
             up=self._scene.up,
         )
 
-    def _pieces(self, asked: WordAnswers) -> Int64[Tensor, "n words"]:
+    def _pieces(self, asked: WordMatches) -> Int64[Tensor, "n words"]:
         """Connected pieces of the Gaussians that answer."""
         inside = self._index.of_gaussians(asked.probabilities) >= self._options.min_probability
         columns = [
@@ -309,8 +309,8 @@ class QuerySession:
         ]
         return torch.stack(columns, dim=1)
 
-    def _found(self, asked: WordAnswers, column: int, pieces: Tensor | None) -> tuple[Found, ...]:
-        """The things that answer to one word, in the order of `Answers.found`."""
+    def _found(self, asked: WordMatches, column: int, pieces: Tensor | None) -> tuple[Found, ...]:
+        """The things that answer to one word, in the order of `QueryResult.found`."""
         probabilities, cosines = asked.probabilities[:, column], asked.cosines[:, column]
         if pieces is None:
             places = self._places or {}
@@ -369,7 +369,7 @@ def query(
     layers: Mapping[str, Layer] | None = None,
     backend: BackendName = "auto",
     observer: Observer = SILENT,
-) -> Answers:
+) -> QueryResult:
     """Ask a scene for words once, see `QuerySession`.
 
     Args:

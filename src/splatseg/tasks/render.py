@@ -148,7 +148,7 @@ class RenderingOptions:
     """Also write DIR/<what>.mp4: depth and labels in colours. Needs splatseg[video]."""
 
     frames: Count = 360
-    """Number of views of split path."""
+    """Number of views of a path."""
 
     fps: float = 24.0
     """Frames per second of the films."""

@@ -26,10 +26,9 @@ from splatseg.io.images import image_camera, load_image
 from splatseg.io.scene import check_name
 from splatseg.io.scene_folder import scene_path, work_on_scene
 from splatseg.models import (
+    DescribedEvidence,
     EvidenceRequest,
     LoadOptions,
-    ModelCache,
-    SeenEvidence,
     TrackingOptions,
     What,
     find_family,
@@ -45,7 +44,10 @@ T = TypeVar("T")
 
 
 @options(
-    removed={"precision": "features are cached in float16; a cache of an earlier version is read"}
+    removed={
+        "cache": "`see --model FOLDER` copies evidence that another scene of the photographs has",
+        "precision": "nothing is cached; evidence has features in float16",
+    }
 )
 class SeeOptions:
     """What a model predicts, of which views, and what is kept."""
@@ -81,10 +83,6 @@ class SeeOptions:
     """Metres of one step of recorded depth maps that are pictures or .npy files, such as 0.001.
     None: they hold inverse depth up to scale and shift."""
 
-    cache: Path | None = None
-    """Folder that keeps the model's answers by the content of the photographs, for other scenes
-    with the same photographs."""
-
     seeds: str | None = None
     """Evidence that says what a tracker follows: masks, panoptic segments, labels or tracks of
     some views, of the scene or its capture."""
@@ -93,7 +91,7 @@ class SeeOptions:
     """Which seeds count, and the order of the views."""
 
     overwrite: bool = False
-    """Replace evidence of this name, once the new one is complete."""
+    """Replace what an earlier run wrote under the same name."""
 
 
 @boundary
@@ -107,7 +105,7 @@ def see(
     loading: LoadOptions | None = None,
     backend: BackendName = "auto",
     observer: Observer = SILENT,
-) -> SeenEvidence:
+) -> DescribedEvidence:
     """Write what a model sees in views to SCENE/evidence/NAME, a file a view.
 
     A view with a photograph is shown by it. One that has none, a virtual view, is drawn, and the
@@ -143,9 +141,6 @@ def see(
     found = _model(model, options, model_options, loading, observer, views=scene.views)
     seeds = None if options.seeds is None else work.evidence(options.seeds)
     tracking = None if seeds is None and options.tracking == TrackingOptions() else options.tracking
-    cache = (
-        None if options.cache is None else ModelCache(folder=options.cache, report=observer.note)
-    )
     if found.note:
         observer.note(f"{found.name}: {found.note}")
     folder = scene_path(root, EVIDENCE_FOLDER, evidence)
@@ -160,7 +155,6 @@ def see(
                 view_spec=view_spec(options.views),
                 overwrite=options.overwrite,
                 allow_missing=options.allow_missing,
-                cache=cache,
                 seeds=seeds,
                 tracking=tracking,
                 image_of=images,
@@ -177,8 +171,6 @@ def see(
         seen = replace(seen, notes=(*seen.notes, note))
     for note in seen.notes:
         observer.note(note)
-    if cache is not None:
-        observer.note(f"{cache.folder}: {cache.size()}")
     return seen
 
 

@@ -89,7 +89,7 @@ class SegmentOptions:
     from it, and stuff classes become one segment each: the layer is panoptic."""
 
     seed: int = 0
-    """Seed of random choices, recorded in the layer."""
+    """Seed of all random choices."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -266,7 +266,7 @@ def save_segmentation(made: Segmentation, root: Path) -> Path:
         record = {"layer": made.name, "method": made.layer.info.method}
         scene = derived_scene(made.refined, "refined", record)
         document = Document(scene=scene, layers={made.name: made.layer})
-        evidence = own_evidence(made.evidence, made.refined)
+        evidence = train_evidence(made.evidence, made.refined)
         save_document(document, made.folder, evidence=evidence)
         return made.folder / "layers" / f"{made.name}.npz"
     path = save_scene_layer(made.layer, root, made.name)
@@ -284,7 +284,7 @@ def derived_scene(scene: Scene, how: str, record: Mapping[str, Any]) -> Scene:
     return replace(scene, provenance=provenance | {how: {"scene": source, **record}})
 
 
-def own_evidence(evidence: Evidence, scene: Scene) -> tuple[Path, ...]:
+def train_evidence(evidence: Evidence, scene: Scene) -> tuple[Path, ...]:
     """Evidence that lies in the scene's own folder, which a new scene could not find."""
     if scene.root is None:
         return ()

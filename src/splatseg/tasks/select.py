@@ -42,7 +42,7 @@ from splatseg.prompting.prompts import (
     Solid,
     ViewPrompt,
 )
-from splatseg.prompting.seen import SeenPrompt, ViewCache, see_prompts
+from splatseg.prompting.seen import ViewCache, VisiblePrompt, see_prompts
 from splatseg.render import BackendName
 from splatseg.tasks.sources import (
     STEPS,
@@ -244,7 +244,7 @@ class SelectionSession:
     ) -> SelectionContext:
         """What prompts in views show."""
         gaussians = self._work.gaussians
-        seen: tuple[SeenPrompt, ...] = ()
+        seen: tuple[VisiblePrompt, ...] = ()
         if shown:
             began = time.perf_counter()
             seen = see_prompts(gaussians, shown, seed=options.seed, views=self._views)

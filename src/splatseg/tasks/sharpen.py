@@ -44,7 +44,7 @@ from splatseg.lift import (
 from splatseg.methods import keeps_boundaries
 from splatseg.render import BackendName
 from splatseg.selection import layer_called
-from splatseg.tasks.segment import derived_scene, own_evidence
+from splatseg.tasks.segment import derived_scene, train_evidence
 from splatseg.tasks.work import (
     SILENT,
     Observer,
@@ -52,7 +52,7 @@ from splatseg.tasks.work import (
     check_new_folder,
     mask_use,
     photographed,
-    views_that_made,
+    source_views,
 )
 
 
@@ -148,7 +148,7 @@ def sharpen_scene(
     layers = {**document.layers, **_sharpened(document, options.layer, merged(layer, found))}
     new = _sharpened_scene(scene, options, how, found, psnr=[before, after])
     document = Document(scene=new, layers=layers)
-    saved = save_document(document, folder, evidence=own_evidence(evidence, scene))
+    saved = save_document(document, folder, evidence=train_evidence(evidence, scene))
     return SharpenedScene(
         folder=folder,
         document=saved,
@@ -190,7 +190,7 @@ def views_to_learn_from(scene: Scene, layer: Labels, evidence: Evidence) -> tupl
     Raises:
         InputError: If there is none.
     """
-    views = views_that_made(scene, layer.info, evidence)
+    views = source_views(scene, layer.info, evidence)
     views = tuple(view for view in views if view.image is not None)
     if not views:
         raise InputError(

@@ -38,7 +38,7 @@ from splatseg.tasks.segment import SegmentOptions, segment_work
 from splatseg.tasks.work import Work
 
 SelectMode = Literal["new", "add", "subtract", "intersect"]
-SelectThreshold = Literal["auto", "fixed", "adaptive", "code"]
+SelectThreshold = Literal["auto", "fixed", "adaptive"]
 SelectPostProcessing = Literal["auto", "full", "published", "none"]
 
 STEPS: Mapping[str, tuple[StepName, ...]] = {
@@ -89,7 +89,7 @@ class SelectOptions:
     threshold: SelectThreshold = "auto"
     """Similarity that features must have. fixed: a cosine of 0.85. adaptive: more than the mean of
     all scores; after masks, mean and deviation of products with 2D features (SAGA, section 3.4).
-    code: as SAGA's published code. auto: adaptive for features trained as published, else fixed."""
+    auto: adaptive for features trained as published, else fixed."""
 
     post_processing: SelectPostProcessing = "auto"
     """Steps after the source. full: remove outliers, grow, refine the border, close holes, add what
@@ -101,7 +101,7 @@ class SelectOptions:
     with it."""
 
     seed: int = 0
-    """Seed of random choices, recorded in the layer."""
+    """Seed of all random choices."""
 
     @property
     def level(self) -> float | None:

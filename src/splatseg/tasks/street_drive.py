@@ -134,15 +134,15 @@ class BlockParts:
         scans = None if self._scans is None else self._scans.of(block)
         if scans is not None and not scans.scan_names and self._builder.options.depth == "auto":
             scans = None  # no laser was on here: depth comes from what else is there
-        built = self._builder.build(
+        field, _, _ = self._builder.build(
             views,
             scans=scans,
             points=None if points is None else points[drive.near(block, points)],
             near=partial(drive.near, block),
             details={"block": block.index, "blocks": len(drive)},
         )
-        self.primitives[block.index] = len(built.field.mesh)
-        return built.field
+        self.primitives[block.index] = len(field.mesh)
+        return field
 
 
 def check_field_name(root: Path, name: str, *, in_blocks: bool) -> None:

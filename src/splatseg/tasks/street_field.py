@@ -1,13 +1,12 @@
-"""Depth of a few views, kept while a field is built from all, to measure its shapes by."""
+"""Mesh fields of drives: points, depth, photographs and label maps become primitives."""
 
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -19,8 +18,6 @@ from splatseg.io.evidence import Evidence
 from splatseg.io.scene import load_scene, new_field_file, remove_field_folder, save_scene
 from splatseg.io.scene_folder import is_scene, scene_lock
 from splatseg.render import BackendName
-from splatseg.report.street_report import DepthError
-from splatseg.report.words import spread
 from splatseg.street.build import (
     PUBLISHED,
     DnmpOptions,
@@ -28,12 +25,8 @@ from splatseg.street.build import (
     MeshFieldInputs,
     build_mesh_field,
 )
-from splatseg.street.depth_views import distances_of
 from splatseg.street.field import MeshField
 from splatseg.street.files import save_mesh_field
-from splatseg.street.geometry import DepthView
-from splatseg.street.hits import PrimitiveCaster
-from splatseg.street.primitives import PrimitiveMesh
 from splatseg.tasks.moving import LeftOut
 from splatseg.tasks.street_inputs import (
     DriveInputs,
@@ -52,117 +45,8 @@ from splatseg.tasks.work import (
     view_spec,
 )
 
-_VIEWS = 6
-_RAYS = 20_000
-"""Of each view, evenly; 28 bytes each."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class DepthSample:
-    """Rays of a view whose depth is known."""
-
-    view: str
-    origin: Float[Tensor, "3"]
-    directions: Float[Tensor, "n 3"]
-    """Of length 1, float32."""
-
-    distances: Float[Tensor, "n"]
-    """Along them, scene units, float32."""
-
-
-class KeptDepths:
-    """Depth of views as it is read, of which samples of a few are kept.
-
-    Args:
-        depths: Of the views.
-        views: Whose depth it is; views without depth may be left out, and are then told by their
-            cameras.
-    """
-
-    def __init__(self, depths: Iterable[DepthView], views: Sequence[View]) -> None:
-        self._depths = depths
-        self._wanted = spread(views, _VIEWS)
-        self.samples: list[DepthSample] = []
-
-    def __iter__(self) -> Iterator[DepthView]:
-        """All of them, as they are."""
-        for depth in self._depths:
-            pose = depth.camera.cam_from_world  # in any size
-            same = (v for v in self._wanted if torch.equal(v.camera.cam_from_world, pose))
-            view = next(same, None)
-            if view is not None:
-                sample = _sample(view, depth)
-                self.samples += [sample] if len(sample.distances) else []
-            yield depth
-
-
-def _sample(view: View, depth: DepthView) -> DepthSample:
-    known = distances_of(depth)
-    row, column = torch.nonzero(known > 0, as_tuple=True)
-    step = max(1, -(-len(row) // _RAYS))
-    row, column = row[::step], column[::step]
-    pixels = torch.stack((column, row), dim=1).double() + 0.5
-    origin, directions = depth.camera.rays(pixels)
-    return DepthSample(
-        view=view.name,
-        origin=origin.double(),
-        directions=directions.float(),
-        distances=known[row, column],
-    )
-
-
-def depth_errors(
-    samples: Sequence[DepthSample],
-    before: PrimitiveMesh,
-    after: PrimitiveMesh,
-    *,
-    metres_per_unit: float,
-) -> tuple[DepthError, ...]:
-    """How far first hits of rays are from their depth, before the fit of shapes and after it."""
-    casters = [PrimitiveCaster(mesh) if len(mesh) else None for mesh in (before, after)]
-    found: list[DepthError] = []
-    for sample in samples:
-        errors = [_errors(caster, sample) for caster in casters]
-        medians = [
-            float(error.median()) * metres_per_unit if len(error) else None for error in errors
-        ]
-        found.append(
-            DepthError(
-                view=sample.view,
-                rays=len(sample.distances),
-                before=medians[0],
-                after=medians[1],
-                met_before=len(errors[0]) / len(sample.distances),
-                met_after=len(errors[1]) / len(sample.distances),
-            )
-        )
-    return tuple(found)
-
-
-def _errors(caster: PrimitiveCaster | None, sample: DepthSample) -> Float[Tensor, "m"]:
-    """Of the rays that meet a primitive, scene units."""
-    if caster is None:
-        return torch.zeros(0)
-    hits = caster.first(sample.origin, sample.directions)
-    met = hits.faces >= 0
-    return (hits.distances[met].float() - sample.distances[met]).abs()
-
-
 _CELLS = 5
 """Points are thinned to so many cells along the side of the finest voxel."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class BuiltField:
-    """A mesh field with its record, and how it came to be."""
-
-    field: MeshField
-    fit: MeshFieldFit
-    sources: str
-    """Where points and depth came from, in words."""
-
-    depths: tuple[DepthSample, ...]
-    """Depth of a few of the views."""
 
 
 class FieldBuilder:
@@ -184,7 +68,7 @@ class FieldBuilder:
         field_options: DnmpOptions | None,
     ) -> None:
         self.work, self.inputs, self.options = work, inputs, options
-        self.chosen = chosen_options(options, field_options)
+        self.chosen = selected_options(options, field_options)
         self.layer = options.layer or inputs.name
         self.timings: dict[str, float] = {}
 
@@ -196,8 +80,8 @@ class FieldBuilder:
         points: Float[Tensor, "n 3"] | None,
         near: Callable[[Float[Tensor, "n 3"]], Bool[Tensor, "n"]] | None = None,
         details: Mapping[str, Any] | None = None,
-    ) -> BuiltField:
-        """Build the field of some views.
+    ) -> tuple[MeshField, MeshFieldFit, str]:
+        """Build the field of some views: it with its record, how, and whence in words.
 
         Args:
             views: To learn from.
@@ -212,7 +96,7 @@ class FieldBuilder:
         began = time.monotonic()
         inputs, observer = self.inputs, self.work.observer
         observer.info("points and depth are gathered")
-        sources = drive_sources(
+        cloud, depths, said = drive_sources(
             self.work,
             views,
             depth=self.options.depth,
@@ -220,15 +104,14 @@ class FieldBuilder:
             points=points,
             cell=min(self.chosen.voxels) / inputs.metres / _CELLS,
         )
-        observer.info(f"from {sources.said}")
-        cloud = sources.points if near is None else sources.points[near(sources.points)]
+        observer.info(f"from {said}")
+        cloud = cloud if near is None else cloud[near(cloud)]
         self._took("points", time.monotonic() - began)
-        depths = KeptDepths(sources.depths(), views)
         with _stages(observer, self._took) as told:
             made = build_mesh_field(
                 MeshFieldInputs(
                     points=cloud,
-                    depths=depths,
+                    depths=depths(),
                     views=views,
                     evidence=inputs.evidence,
                     classes=inputs.evidence.classes or self.work.scene.classes,
@@ -240,7 +123,7 @@ class FieldBuilder:
                 progress=told,
             )
         left_out = {} if inputs.moving is None else {"moving": inputs.moving.record}
-        more = {"sources": sources.said, **left_out, **(details or {})}
+        more = {"sources": said, **left_out, **(details or {})}
         info = replace(
             made.field.info,
             evidence=inputs.name,
@@ -248,14 +131,13 @@ class FieldBuilder:
             versions=layer_versions(),
             details={**made.field.info.details, **more},
         )
-        field = made.field.with_layer(info=info)
-        return BuiltField(field=field, fit=made, sources=sources.said, depths=tuple(depths.samples))
+        return made.field.with_layer(info=info), made, said
 
     def _took(self, stage: str, seconds: float) -> None:
         self.timings[stage] = self.timings.get(stage, 0.0) + seconds
 
 
-def chosen_options(options: StreetOptions, given: DnmpOptions | None) -> DnmpOptions:
+def selected_options(options: StreetOptions, given: DnmpOptions | None) -> DnmpOptions:
     """How fields are made: as given, in the published setting where the field is to be that."""
     if given is None:
         return PUBLISHED if options.published else DnmpOptions()
@@ -306,9 +188,6 @@ class StreetField:
     evidence: Evidence
     sources: str
     """Where points and depth came from, in words."""
-
-    depths: tuple[DepthSample, ...] = ()
-    """Depth of a few of the views, to measure shapes by."""
 
     moving: LeftOut | None = None
     """What was left out with moving things; None where nothing was to be."""
@@ -422,21 +301,20 @@ def street_field(
     work = Work(scene=scene, backend=backend, observer=observer)
     with drive_inputs(work, options) as inputs:
         builder = FieldBuilder(work, inputs, options, field_options)
-        made = builder.build(
+        field, fit, said = builder.build(
             inputs.views,
             scans=inputs.scans,
             points=capture_points(inputs.capture) if points is None else points,
         )
     return StreetField(
-        field=made.field,
+        field=field,
         name=options.field,
-        layer=made.field.layer_names[0],
-        fit=made.fit,
+        layer=field.layer_names[0],
+        fit=fit,
         # As the scene has them: masks without moving things were there for the training alone.
         views=tuple(scene.view(view.name) for view in inputs.views),
         evidence=inputs.evidence,
-        sources=made.sources,
-        depths=made.depths,
+        sources=said,
         moving=inputs.moving,
         timings=builder.timings,
     )

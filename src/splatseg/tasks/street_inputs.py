@@ -100,7 +100,7 @@ class StreetOptions:
     """Use the setting of the papers: networks, rates, 5 000 and 50 000 iterations."""
 
     seed: int = 0
-    """Seed of random choices, recorded in the field."""
+    """Seed of all random choices."""
 
     def __post_init__(self) -> None:
         check_name("field", self.field)
@@ -127,20 +127,6 @@ MAX_DEPTH = 50.0
 """z-depth above which maps give no points, metres."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class DriveSources:
-    """What is known of the surfaces of a drive."""
-
-    points: Float[Tensor, "n 3"]
-    """World, scene units, thinned."""
-
-    depths: Callable[[], Iterable[DepthView]]
-    """Depth of views, read once each time."""
-
-    said: str
-    """Where both come from, in words."""
-
-
 def drive_sources(
     work: Work,
     views: Sequence[View],
@@ -149,7 +135,7 @@ def drive_sources(
     scans: ScanSource | None,
     points: Float[Tensor, "n 3"] | None,
     cell: float,
-) -> DriveSources:
+) -> tuple[Float[Tensor, "n 3"], Callable[[], Iterable[DepthView]], str]:
     """Points and depth of a drive.
 
     Points are those of scans and of the capture together. Where depth is dense (of Gaussians,
@@ -166,6 +152,10 @@ def drive_sources(
         scans: In the world of the scene.
         points: The capture's, world, scene units.
         cell: Side of the cells of which each gives one point, scene units.
+
+    Returns:
+        Points, world, scene units, thinned; depth of views, read once each time; where both come
+        from, in words.
 
     Raises:
         InputError: If what is asked for is not there, or there are no points at all.
@@ -207,7 +197,7 @@ def drive_sources(
         "scans+gaussians": "depth of scans, and of the Gaussians where no laser looked",
     }
     words.append(said.get(kind, f"depth of {kind}"))
-    return DriveSources(points=cloud, depths=depths, said=", ".join(words))
+    return cloud, depths, ", ".join(words)
 
 
 def source_capture(source: Path | None) -> Capture | None:

@@ -18,7 +18,7 @@ from splatseg.evaluate.street_names import street_class
 from splatseg.io.depths import depth_kind
 from splatseg.io.images import image_camera, load_image
 from splatseg.io.scene_folder import scene_path, work_on_scene
-from splatseg.lift.viewed_points import points_in_sight
+from splatseg.lift.viewed_points import points_in_view
 from splatseg.report.colours import colour_labels, layer_colours
 from splatseg.report.html import Notice
 from splatseg.report.images import Gallery, GalleryImage, colour_depth
@@ -34,11 +34,9 @@ from splatseg.report.street_report import (
 from splatseg.report.words import count_text, spread
 from splatseg.street.depth_views import capture_views, field_views
 from splatseg.street.field import VERTEX_WORDS
-from splatseg.street.geometry import enclosing
-from splatseg.street.shape_files import load_shapes
 from splatseg.tasks.scan_labels import LabelBy, ScanLabels
 from splatseg.tasks.street_drive import StreetDrive
-from splatseg.tasks.street_field import StreetField, depth_errors
+from splatseg.tasks.street_field import StreetField
 from splatseg.tasks.work import REPORTS_FOLDER, photographed, write_page
 
 _VIEWS = 4
@@ -153,16 +151,8 @@ def _making(made: StreetField | StreetDrive | None, scene: Scene) -> dict[str, A
         )
         for level, side in enumerate(mesh.sizes)
     )
-    before = start.mesh(load_shapes())
-    # Those around cameras are removed before the fit: they say nothing of shapes.
-    eyes = torch.stack([view.camera.centre for view in made.views])
-    around = enclosing(before, eyes)
-    if not bool(around.all()):
-        before = start.subset(~around).mesh(load_shapes())
-    errors = depth_errors(made.depths, before, mesh, metres_per_unit=metres)
     return told | {
         "levels": levels,
-        "depth": errors,
         "shaping": made.fit.geometry.records,
         "training": made.fit.radiance.records,
     }
@@ -223,7 +213,7 @@ def _counts(
     truth = true_ids(kept.truth, scans.classes, field.layer(layer))
     scores, sight = (), ""
     if bool((truth != UNLABELLED).any()):
-        seen, sight = in_sight(scene, field, layer, kept.points)
+        seen, sight = visibility_of_points(scene, field, layer, kept.points)
         scores = point_scores(kept.ids, truth, seen)
     return PointCounts(
         folder=str(folder.relative_to(root) if inside else folder),
@@ -286,7 +276,7 @@ def point_scores(
     return tuple(rows)
 
 
-def in_sight(
+def visibility_of_points(
     scene: Scene, field: Renderable, layer: str, points: Float[Tensor, "n 3"]
 ) -> tuple[Bool[Tensor, "n"], str]:
     """Which points the views saw that a layer was made from, and by whose depth.
@@ -301,7 +291,7 @@ def in_sight(
     mapped = all(v.depth is not None and depth_kind(v.depth) != "relative" for v in views)
     depths = capture_views(views) if mapped else field_views(field, [v.camera for v in views])
     pairs = ((view.camera, view.depth) for view in depths)
-    seen = points_in_sight(points, pairs, metres_per_unit=scene.metres_per_unit or 1.0)
+    seen = points_in_view(points, pairs, metres_per_unit=scene.metres_per_unit or 1.0)
     return seen, "the capture's depth maps" if mapped else "the depth that the field shows"
 
 

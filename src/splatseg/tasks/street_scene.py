@@ -20,7 +20,12 @@ from splatseg.tasks.scan_labels import (
     viewed_points,
 )
 from splatseg.tasks.street_drive import StreetDrive, check_field_name, is_stopped, street_drive
-from splatseg.tasks.street_field import StreetField, chosen_options, save_street_field, street_field
+from splatseg.tasks.street_field import (
+    StreetField,
+    save_street_field,
+    selected_options,
+    street_field,
+)
 from splatseg.tasks.street_inputs import StreetOptions
 from splatseg.tasks.street_report import LabelledScans, report_street
 from splatseg.tasks.work import SILENT, Observer, Work, scene_field
@@ -93,7 +98,7 @@ def street_scene(
     field: Renderable | None = None
     made: StreetField | StreetDrive | None = None
     if scans is not None and by != "gaussians" and not overwrite:
-        field = made_street_field(scene, options=options, field_options=field_options)
+        field = street_field_of_scene(scene, options=options, field_options=field_options)
     if field is None and (scans is None or by != "gaussians"):
         made = make_street_field(
             scene,
@@ -196,7 +201,7 @@ def make_street_field(
 
 
 @boundary
-def made_street_field(
+def street_field_of_scene(
     scene: Scene,
     *,
     options: StreetOptions | None = None,
@@ -225,7 +230,7 @@ def made_street_field(
     in_blocks = options.block_length is not None
     if in_blocks and is_stopped(scene_field_path(scene.root, options.field)):
         return None
-    chosen = chosen_options(options, field_options)
+    chosen = selected_options(options, field_options)
     default = chosen.vertex_rule is None and chosen.setting == "fast"
     rule = None if default else chosen.effective_vertex_rule
     return scene_field(scene, options.field, vertex_rule=rule)

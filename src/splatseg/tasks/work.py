@@ -1,11 +1,11 @@
 """A scene opened for work: what tasks resolve once and pass on, and who is told of the progress."""
 
 import importlib.metadata
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import torch
 
@@ -38,8 +38,6 @@ from splatseg.render.paths import camera_path, is_forward_facing
 from splatseg.report.html import Report, report_html
 
 if TYPE_CHECKING:
-    from splatseg.fit import FitProgress
-    from splatseg.pose import PoseProgress
     from splatseg.street.field import VertexRule
 
 EVIDENCE_FOLDER = "evidence"
@@ -47,6 +45,14 @@ EXPORTS_FOLDER = "exports"
 REPORTS_FOLDER = "reports"
 
 _FOCUS_PIXELS = 128
+
+
+class Step(Protocol):
+    """Tells how far a stage is; `text` says it in words, for who wants more than numbers."""
+
+    def __call__(self, done: int, total: int, text: str = "") -> None:
+        """So many of so many steps are done; of 0 where the number is not known."""
+        ...
 
 
 class Observer:
@@ -73,25 +79,13 @@ class Observer:
         """What was found or decided on the way; a line without a full stop."""
 
     @contextmanager
-    def stage(self, stage: str) -> Generator[Callable[[int, int], None]]:
-        """Tell of a stage from its start to its end; gives a function of (done, total)."""
+    def stage(self, stage: str) -> Generator[Step]:
+        """Tell of a stage from its start to its end; gives a function of (done, total, text)."""
         self.started(stage)
         try:
-            yield lambda done, total: self.progress(stage, done, total)
+            yield lambda done, total, text="": self.progress(stage, done, total)
         finally:
             self.finished(stage)
-
-    @contextmanager
-    def fit_stage(self) -> Generator["Callable[[FitProgress], None]"]:
-        """The stage ``fit``, for who wants the loss and the number of Gaussians as well."""
-        with self.stage("fit") as step:
-            yield lambda now: step(round(1000 * now.progress), 1000)
-
-    @contextmanager
-    def pose_stage(self) -> Generator["Callable[[PoseProgress], None]"]:
-        """The stage ``poses``, for who wants the names of its parts as well."""
-        with self.stage("poses") as step:
-            yield lambda now: step(now.done, now.total)
 
 
 SILENT = Observer()
@@ -309,7 +303,7 @@ def scene_field(scene: Scene, name: str, *, vertex_rule: "VertexRule | None" = N
     return load_mesh_field(path).with_layer(vertex_rule=vertex_rule)
 
 
-def views_that_made(scene: Scene, info: LayerInfo, evidence: Evidence) -> tuple[View, ...]:
+def source_views(scene: Scene, info: LayerInfo, evidence: Evidence) -> tuple[View, ...]:
     """Views with evidence that made a layer, where it says which; else the training views."""
     known = set(evidence.view_names)
     names = None if info.views is None else set(info.views)

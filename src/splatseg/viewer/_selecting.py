@@ -28,7 +28,7 @@ from splatseg.errors import InputError
 from splatseg.prompting.next_click import next_click
 from splatseg.prompting.pipeline import SceneIndex
 from splatseg.prompting.prompts import AxisBox, Ball, Lasso, SelectionPrompt, ViewPrompt
-from splatseg.prompting.seen import SeenPrompt
+from splatseg.prompting.seen import VisiblePrompt
 from splatseg.render import BackendName
 from splatseg.selection import pieces
 from splatseg.tasks.query import QuerySession
@@ -79,7 +79,7 @@ class ColourSource:
         self._neighbours = neighbours
 
     def membership(
-        self, prompts: Sequence[SeenPrompt], *, granularity: float | None
+        self, prompts: Sequence[VisiblePrompt], *, granularity: float | None
     ) -> Float[Tensor, "n"]:
         """How likely each Gaussian belongs to what prompts show, see `MembershipSource`."""
         inside, outside = (
@@ -109,7 +109,7 @@ class ColourSource:
     def _colours(self) -> Tensor:
         return self._gaussians.colours.detach().cpu().double().clamp(0, 1)
 
-    def _pointed_at(self, prompts: Sequence[SeenPrompt], *, positive: bool) -> Tensor:
+    def _pointed_at(self, prompts: Sequence[VisiblePrompt], *, positive: bool) -> Tensor:
         """Rows of what pixels of one sign show most of, the most first."""
         mass = torch.zeros(len(self._gaussians), dtype=torch.float64)
         for prompt in prompts:
@@ -136,7 +136,7 @@ class ColourSource:
         return member
 
 
-def _seen_within(gaussians: Gaussians, prompt: SeenPrompt) -> Tensor:
+def _seen_within(gaussians: Gaussians, prompt: VisiblePrompt) -> Tensor:
     """Which Gaussians have their centre where a box or a mask allows the thing to be."""
     if prompt.inside is None:
         return torch.ones(len(gaussians), dtype=torch.bool)

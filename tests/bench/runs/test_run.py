@@ -184,9 +184,9 @@ class StopsOnce(Observer):
     stopped = False
 
     @contextmanager
-    def fit_stage(self):
-        def step(now) -> None:
-            if now.step == 3 and not self.stopped:
+    def stage(self, stage: str):
+        def step(done: int, total: int, text: str = "") -> None:
+            if stage == "fit" and text.startswith("step 3,") and not self.stopped:
                 self.stopped = True
                 raise KeyboardInterrupt
 

@@ -328,16 +328,16 @@ def test_label_studio(tmp_path: Path, change: dict[str, Any], message: str) -> N
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("a.zip", b"PK", "unpack it"),
-        ("a.pkl", b"\x80", "COCO run lengths in JSON"),
-        ("a.pth", b"PK", "coco_instances_results.json"),
-        ("a.txt", b"0 0.1 0.2", "YOLO"),
-        ("a.csv", b"a,b", "export JSON, COCO or CVAT"),
+        ("a.zip", b"PK", "in .zip files are not read; export COCO"),
+        ("a.pkl", b"\x80", "in .pkl files are not read"),
+        ("a.pth", b"PK", "in .pth files are not read"),
+        ("a.txt", b"0 0.1 0.2", "in .txt files are not read"),
+        ("a.csv", b"a,b", "in .csv files are not read"),
         ("a.png", b"", "give the folder"),
-        ("a.bin", b"", "table of what is read"),
+        ("a.bin", b"", "docs/models.md has a table"),
         ("a.json", b'{"a": 1}', "annotations .COCO, Label Studio, labelme., got another JSON"),
         ("a.json", b"[" * 100_000, "cannot be parsed"),
-        ("a.json", b'[{"id": 1, "annotation_id": 2, "lead_time": 3}]', "JSON-MIN"),
+        ("a.json", b'[{"id": 1, "annotation_id": 2, "lead_time": 3}]', "got another JSON"),
         ("a.json", b'[{"image_id": 1, "category_id": 2, "bbox": [], "score": 1}]', "without any"),
         ("a.json", b'[{"image_id": 1, "category_id": 2}, 3]', ".1.: expected an object, got 3"),
         (

@@ -180,9 +180,8 @@ def test_names_of_classes_that_a_file_lacks() -> None:
         opened("coco-instances", classes="coco")
 
 
-def test_datumaro_s_own_format_is_refused_with_advice() -> None:
-    with pytest.raises(InputError, match="datumaro's own format; export COCO, CVAT"):
-        opened("datumaro")
+def test_datumaro_s_own_format_is_none() -> None:
+    assert open_annotations(GOLDEN / "datumaro") is None
 
 
 def test_without_views_a_picture_is_called_by_its_path() -> None:

@@ -96,10 +96,10 @@ def test_lenses_see_what_colmap_sees(golden_colmap, model) -> None:
     camera = Camera(
         width=WIDTH,
         height=HEIGHT,
-        fx=found.fx,
-        fy=found.fy,
-        cx=found.cx,
-        cy=found.cy,
+        fx=found.focal[0],
+        fy=found.focal[1],
+        cx=found.centre[0],
+        cy=found.centre[1],
         model=found.model,
         distortion=found.distortion,
         cam_from_world=torch.eye(4, dtype=torch.float64),
@@ -140,7 +140,7 @@ def test_models_of_ours_are_read(name) -> None:
         height=8,
         parameters=(4.0,) * next(lens.parameters for lens in MODELS if lens.name == name),
     )
-    assert intrinsics_of(raw, where="x").width == 8
+    assert intrinsics_of(raw, where="x").size == (8, 8)
 
 
 @pytest.mark.parametrize("folder", ["sparse/0", "sparse", "colmap/sparse/0", "."])
@@ -239,7 +239,7 @@ def test_impossible_frames_are_refused(rig_capture, change, message) -> None:
 def test_a_frame_with_fewer_images_than_it_says_is_refused_at_once(tmp_path, count) -> None:
     path = tmp_path / "frames.txt"
     path.write_text("# comment\n1 1 1 0 0 0 0 0 0 2 CAMERA 1 11 CAMERA 2 12\n")
-    assert next(read_records(path)).images == ((1, 11), (2, 12))
+    assert next(read_records(path))[2] == ((1, 11), (2, 12))
     path.write_text(path.read_text().replace("0 2 CAMERA", f"0 {count} CAMERA"))
     with pytest.raises(FileFormatError, match=r"frames\.txt: line 2: expected FRAME_ID"):
         list(read_records(path))

@@ -1,4 +1,4 @@
-"""Boxes of Waymo, of both its forms: on the clock of its photographs and scans."""
+"""Boxes of Waymo: on the clock of its photographs and scans."""
 
 import math
 
@@ -9,7 +9,6 @@ from splatseg.core.rigid import rotation_from_quaternion
 from splatseg.core.scans import inside_boxes
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.io.captures import read_capture
-from splatseg.io.json_files import write_json
 from splatseg.io.moving import StaticScans, mask_moving, read_moving, view_times
 from splatseg.io.scans import read_scans
 from support.waymo_files import (
@@ -25,7 +24,6 @@ from support.waymo_files import (
     write_component,
     write_segment,
 )
-from support.waymo_tfrecord import write_tfrecord
 
 AT = [place - origin for place, origin in zip(PLACE, ORIGIN, strict=True)]
 
@@ -105,32 +103,19 @@ def told(boxes) -> list:
     return [(b.size, b.start, b.end, b.name, b.centre.tolist(), b.rotation.tolist()) for b in boxes]
 
 
-def test_the_older_form_has_the_same_boxes(tmp_path) -> None:
-    (tmp_path / "v1").mkdir()
-    file = write_tfrecord(tmp_path / "v1", tiny_rows())
-    known = told(read_moving(write_segment(tmp_path / "v2")))
+def test_a_component_stands_for_its_segment(tmp_path) -> None:
+    known = told(read_moving(write_segment(tmp_path)))
     assert len(known) == 2
-    assert told(read_moving(file)) == known
-    component = tmp_path / "v2" / "lidar_box" / f"{CONTEXT}.parquet"
-    assert told(read_moving(component)) == known
-    assert told(read_moving(tmp_path / "v2" / "lidar" / f"{CONTEXT}.parquet")) == known
+    for component in ("lidar_box", "lidar"):
+        assert told(read_moving(tmp_path / component / f"{CONTEXT}.parquet")) == known
 
 
-def test_components_that_were_written_without_boxes_are_written_again(tmp_path) -> None:
-    file = write_tfrecord(tmp_path, tiny_rows())
-    read_capture(file)
-    folder = tmp_path / f"{file.name}.components"
-    (folder / "lidar_box" / f"{CONTEXT}.parquet").unlink()
-    write_json({"bytes": file.stat().st_size}, folder / "source.json")
-    assert len(read_moving(file)) == 2
-
-
-def test_labels_that_are_no_boxes(tmp_path) -> None:
-    rows = tiny_rows()
-    rows["lidar_box"] = []
-    file = write_tfrecord(tmp_path, rows)
-    with pytest.raises(MissingFileError, match="needs its component lidar_box"):
-        read_moving(file)
+@pytest.mark.parametrize("read", [read_capture, read_scans, read_moving])
+def test_version_1_is_refused(tmp_path, read) -> None:
+    file = tmp_path / "segment-1_with_camera_labels.tfrecord"
+    file.write_bytes(b"")
+    with pytest.raises(InputError, match=f"{file.name}: .*not read; .*Parquet files of version 2"):
+        read(file)
 
 
 @pytest.mark.parametrize("component", ["lidar_box", "vehicle_pose"])

@@ -128,12 +128,12 @@ def test_ply_headers(golden: Path, tmp_path: Path) -> None:
     def edited(old: bytes, new: bytes, message: str) -> None:
         refused(tmp_path / "a.ply", edited_ply(golden, old, new), message)
 
-    edited(b"binary_little_endian", b"ascii", "expected lines of 28 numbers|expected 3 lines")
+    edited(b"binary_little_endian", b"ascii", "expected 3 rows of 'vertex'")
     edited(b"binary_little_endian", b"morse", "cannot read the PLY header line 'format morse")
     edited(b"format binary_little_endian 1.0\n", b"", "one PLY line of the format, got 0")
-    edited(b"vertex 3\n", b"vertex 4\n", "truncated")
-    edited(b"vertex 3\n", b"vertex 2\n", "longer than its counts")
-    edited(b"vertex 3\n", b"vertex 99999999999999\n", "truncated")
+    edited(b"vertex 3\n", b"vertex 4\n", "the file ends early")
+    edited(b"vertex 3\n", b"vertex 2\n", "expected the end of the file .*, got 112 bytes more")
+    edited(b"vertex 3\n", b"vertex 99999999999999\n", "the file ends early")
     edited(b"vertex 3\n", b"vertex -3\n", "cannot read the PLY header line 'element vertex -3'")
     edited(b"vertex 3\n", b"vertex 3.0\n", "cannot read the PLY header line")
     edited(b"float x\n", b"quad x\n", "cannot read the PLY header line 'property quad x'")
@@ -475,12 +475,12 @@ def test_sog_names_stay_in_the_folder(golden: Path, tmp_path: Path) -> None:
         meta = json.loads(files["meta.json"])
         meta["quats"]["files"] = [name]
         (folder / "meta.json").write_text(json.dumps(meta))
-        with pytest.raises(FileFormatError, match="expected the name of a file beside it"):
+        with pytest.raises(FileFormatError, match="expected the name of a file in its folder"):
             read_splats(folder)
     (folder / "meta.json").write_bytes(files["meta.json"])
     (folder / "quats.webp").unlink()
     with pytest.raises(
-        MissingFileError, match=r"no such file as 'quats\.webp', which meta\.json names"
+        MissingFileError, match=r"a file 'quats\.webp', which meta\.json names, got none"
     ):
         read_splats(folder)
 

@@ -16,7 +16,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from splatseg.core import Gaussians, Similarity
-from splatseg.io.ply import ply_offsets, read_ply_header
+from splatseg.io.ply import read_ply_header
 from splatseg.io.splats import read_splats, write_splats
 from splatseg.io.splats.compressed_ply import CHUNK
 
@@ -81,8 +81,7 @@ def half_steps(path: Path, name: str, count: int) -> torch.Tensor:
     """Half a step of packed columns of a compressed PLY, from the chunks in the file."""
     header = read_ply_header(path)
     chunk = header.element("chunk")
-    at = ply_offsets(path, header)["chunk"]
-    table = np.fromfile(path, chunk.dtype("<"), chunk.count, offset=at)
+    table = np.fromfile(path, chunk.dtype("<"), chunk.count, offset=header.offset)
     axes = ("r", "g", "b") if name == "colour" else [f"{name}{axis}" for axis in "xyz"]
     spans = np.stack([table[f"max_{axis}"] - table[f"min_{axis}"] for axis in axes], axis=1)
     top = [255, 255, 255] if name == "colour" else [2047, 1023, 2047]

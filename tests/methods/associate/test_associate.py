@@ -264,7 +264,7 @@ def test_what_views_of_one_group_see_of_another(rng, monkeypatch, size) -> None:
     one, other = rng.integers(0, 30, 50), rng.integers(0, 30, 50)
     monkeypatch.setattr(module, "_CELLS", size)
     monkeypatch.setattr(module, "_PAIRS", size)
-    found = module.seen_by(seen, members, one, other)
+    found = module.visible_in(seen, members, one, other)
     expected = (seen.toarray()[one] * members.toarray()[other]).sum(axis=1)
     np.testing.assert_allclose(found, expected)
 

@@ -30,8 +30,8 @@ def best(views, max_views: int):
         rows += [(g, s, m, seen[g], index) for g, s, m in zip(gaussian, segment, mass, strict=True)]
     chosen = {}
     for g in range(GAUSSIANS):
-        sights = {(-row[3], row[4]) for row in rows if row[0] == g}
-        chosen[g] = {index for _, index in sorted(sights)[:max_views]}
+        visibility_of_masks = {(-row[3], row[4]) for row in rows if row[0] == g}
+        chosen[g] = {index for _, index in sorted(visibility_of_masks)[:max_views]}
     return [row[:4] for row in rows if row[4] in chosen[row[0]]]
 
 

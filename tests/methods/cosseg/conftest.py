@@ -7,9 +7,9 @@ import torch
 
 from splatseg.core import Camera, FeatureMap, Gaussians, LabelMap, MaskSet, View
 from splatseg.core.models import DeepFeatures
-from splatseg.methods.cosseg.checkpoint import save_point_encoder
 from splatseg.methods.cosseg.network import RandlaEncoder
 from splatseg.methods.cosseg.pyramid import PointInputs, RandlaConfig
+from splatseg_bench.point_network import save_point_encoder
 from support.backends import each_backend as each_backend
 from support.backends import pytest_generate_tests as pytest_generate_tests
 

@@ -9,18 +9,17 @@ from splatseg.methods.cosseg.pyramid import (
     PointPyramid,
     PyramidOptions,
     RandlaConfig,
-    RandlaVariant,
     point_pyramid,
 )
 
 M = TypeVar("M", bound=nn.Module)
 
 
-def small_config(variant: RandlaVariant | None = None, inputs: int = 6) -> RandlaConfig:
+def small_config(sum_slope: float = 0.2, inputs: int = 6) -> RandlaConfig:
     """Three levels with neighbours, of widths that no two layers share."""
     return RandlaConfig(
         inputs=inputs, first_width=5, widths=(4, 8, 6), neighbours=4, ratios=(2, 3, 2),
-        classes=3, variant=RandlaVariant() if variant is None else variant,
+        classes=3, sum_slope=sum_slope,
     )  # fmt: skip
 
 

@@ -1,6 +1,6 @@
 """RandLA-Net's encoder as its papers and programs write it: one point and one neighbour at a time.
 
-Everything is in float64 and in the order of whoever wrote it, which a `Dialect` says.
+Everything is in float64.
 """
 
 from collections.abc import Callable
@@ -11,6 +11,7 @@ import numpy as np
 from splatseg.methods.cosseg.pyramid import PointPyramid
 
 Array = np.ndarray
+SLOPE = 0.2
 
 
 @dataclass(frozen=True)
@@ -40,31 +41,6 @@ def published_ten(point: Array, neighbour: Array) -> Array:
     return np.concatenate(([np.sqrt((offset**2).sum())], offset, point, neighbour))
 
 
-def squared_ten(point: Array, neighbour: Array) -> Array:
-    """The order of the paper, with the square of the distance."""
-    offset = point - neighbour
-    return np.concatenate((point, neighbour, offset, [(offset**2).sum()]))
-
-
-@dataclass(frozen=True)
-class Dialect:
-    """How an implementation writes a network."""
-
-    ten: Callable[[Array, Array], Array] = published_ten
-    features_first: bool = True
-    chained: bool = True
-    own: bool = False
-    pooled: bool = True
-    start: float = 0.2
-    entry: float = 0.2
-    inner: float = 0.2
-    total: float = 0.2
-
-    def join(self, features: Array, encoding: Array) -> Array:
-        pair = (features, encoding) if self.features_first else (encoding, features)
-        return np.concatenate(pair)
-
-
 LayerOf = Callable[[str], Layer]
 ScoreOf = Callable[[str], Array]
 
@@ -78,27 +54,31 @@ def attentive_pooling(values: list[Array], score: Array, layer: Layer, slope: fl
 
 
 def residual_block(
-    points: Array, features: Array, neighbours: Array, layer: LayerOf, score: ScoreOf, d: Dialect
+    points: Array,
+    features: Array,
+    neighbours: Array,
+    layer: LayerOf,
+    score: ScoreOf,
+    sum_slope: float,
 ) -> Array:
     """A dilated residual block of all points of a level."""
     n = len(points)
-    entered = [layer("entry")(features[i], d.entry) for i in range(n)]
-    ten = [[d.ten(points[i], points[j]) for j in neighbours[i]] for i in range(n)]
-    first = [[layer("encode1")(one, d.inner) for one in row] for row in ten]
+    entered = [layer("entry")(features[i], SLOPE) for i in range(n)]
+    ten = [[published_ten(points[i], points[j]) for j in neighbours[i]] for i in range(n)]
+    first = [[layer("encode1")(one, SLOPE) for one in row] for row in ten]
     pooled = []
     for i in range(n):
-        seen = [entered[i if d.own else j] for j in neighbours[i]]
-        joined = [d.join(f, e) for f, e in zip(seen, first[i], strict=True)]
-        pooled.append(attentive_pooling(joined, score("pool1"), layer("pool1"), d.inner))
-    source = first if d.chained else ten
-    second = [[layer("encode2")(one, d.inner) for one in row] for row in source]
+        seen = [entered[j] for j in neighbours[i]]
+        joined = [np.concatenate(pair) for pair in zip(seen, first[i], strict=True)]
+        pooled.append(attentive_pooling(joined, score("pool1"), layer("pool1"), SLOPE))
+    second = [[layer("encode2")(one, SLOPE) for one in row] for row in first]
     found = []
     for i in range(n):
-        seen = [pooled[i if d.own else j] for j in neighbours[i]]
-        joined = [d.join(f, e) for f, e in zip(seen, second[i], strict=True)]
-        once_more = attentive_pooling(joined, score("pool2"), layer("pool2"), d.inner)
+        seen = [pooled[j] for j in neighbours[i]]
+        joined = [np.concatenate(pair) for pair in zip(seen, second[i], strict=True)]
+        once_more = attentive_pooling(joined, score("pool2"), layer("pool2"), SLOPE)
         total = layer("exit")(once_more, 1.0) + layer("shortcut")(features[i], 1.0)
-        found.append(leaky(total, d.total))
+        found.append(leaky(total, sum_slope))
     return np.array(found)
 
 
@@ -108,19 +88,19 @@ def encoder_levels(
     start: Layer,
     layer: Callable[[int], LayerOf],
     score: Callable[[int], ScoreOf],
-    d: Dialect,
+    sum_slope: float,
 ) -> list[Array]:
     """What `RandlaEncoder.forward` returns."""
     positions = pyramid.positions.double().numpy()
-    features = np.array([start(x, d.start) for x in inputs])
+    features = np.array([start(x, SLOPE) for x in inputs])
     levels: list[Array] = []
     for level, neighbours in enumerate(pyramid.neighbours):
         points = positions[pyramid.kept[level].numpy()]
         near = neighbours.numpy()
-        found = residual_block(points, features, near, layer(level), score(level), d)
+        found = residual_block(points, features, near, layer(level), score(level), sum_slope)
         if level == 0:
             levels.append(found)
         kept = pyramid.pool[level].numpy()
-        features = np.array([found[near[i]].max(axis=0) if d.pooled else found[i] for i in kept])
+        features = np.array([found[near[i]].max(axis=0) for i in kept])
         levels.append(features)
     return levels

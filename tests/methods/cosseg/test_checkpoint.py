@@ -16,52 +16,46 @@ from splatseg.methods.cosseg import checkpoint
 from splatseg.methods.cosseg.checkpoint import (
     SHIPPED,
     load_point_encoder,
-    load_point_network,
-    save_point_encoder,
-    save_point_network,
 )
-from splatseg.methods.cosseg.network import RandlaEncoder, RandlaNet
+from splatseg.methods.cosseg.network import RandlaEncoder
 from splatseg.methods.cosseg.points import spatial_features, spatial_frame
 from splatseg.methods.cosseg.pyramid import (
     PUBLISHED_S3DIS,
     PointInputs,
     PyramidOptions,
     RandlaConfig,
-    RandlaVariant,
     point_pyramid,
 )
+from splatseg_bench.point_network import save_point_encoder
 from splatseg_bench.worlds._recorded import SurfaceOptions, surface_points
 from splatseg_bench.worlds._streets import street
 
-from .layouts import FIRST, WIDTHS, WRITERS, answer, state_dict
+from .layouts import FIRST, WIDTHS, answer, state_dict
 from .point_scenes import pyramid_of, randomised, scene, small_config
 
 INPUTS = PointInputs(grid_size=0.05, origin="floor", colour_range=255.0)
 FACTS = {"rooms": 12, "rate": 0.01, "augmented": ["rotated", "scaled"]}
-VARIANT = RandlaVariant(
-    distance="squared", second_encoding="direct", paired_features="own", sampling="own",
-    start_slope=0.3, entry_slope=0.1, slope=0.0, sum_slope=0.01, epsilon=1e-5,
-)  # fmt: skip
+SUM_SLOPE = 0.01
 
 
 @pytest.fixture
 def saved(tmp_path: Path) -> Path:
     path = tmp_path / "a.safetensors"
-    encoder = randomised(RandlaEncoder(small_config(VARIANT)))
+    encoder = randomised(RandlaEncoder(small_config(SUM_SLOPE)))
     save_point_encoder(encoder, path, inputs=INPUTS, facts=FACTS)
     return path
 
 
 def test_an_encoder_comes_back(saved: Path) -> None:
     found = load_point_encoder(saved)
-    assert found.config == small_config(VARIANT)
+    assert found.config == small_config(SUM_SLOPE)
     assert found.inputs == INPUTS
     assert (found.source, found.layout, found.assumed) == ("a.safetensors", "splatseg", ())
     assert found.recipe == FACTS
     assert found.colour
     assert not found.encoder.training
     assert not any(parameter.requires_grad for parameter in found.encoder.parameters())
-    before = randomised(RandlaEncoder(small_config(VARIANT))).state_dict()
+    before = randomised(RandlaEncoder(small_config(SUM_SLOPE))).state_dict()
     for name, tensor in found.encoder.state_dict().items():
         if name.endswith("num_batches_tracked"):
             continue
@@ -72,7 +66,7 @@ def test_an_encoder_comes_back(saved: Path) -> None:
 
 
 def test_features_are_those_of_rounded_weights(saved: Path) -> None:
-    config = small_config(VARIANT)
+    config = small_config(SUM_SLOPE)
     positions, colours = scene()
     pyramid, inputs = pyramid_of(positions, config), torch.cat((positions, colours), dim=1)
     before = randomised(RandlaEncoder(config))(pyramid, inputs)
@@ -89,29 +83,6 @@ def test_a_published_one_is_small(tmp_path: Path) -> None:
     path = tmp_path / "a.safetensors"
     save_point_encoder(RandlaEncoder(PUBLISHED_S3DIS), path, inputs=INPUTS, facts={})
     assert path.stat().st_size < 6_000_000
-
-
-def test_a_network_comes_back(tmp_path: Path) -> None:
-    path = tmp_path / "a.safetensors"
-    network = randomised(RandlaNet(small_config()))
-    save_point_network(network, path, inputs=INPUTS, facts=FACTS)
-    found = load_point_network(path)
-    assert found.training
-    assert all(parameter.requires_grad for parameter in found.parameters())
-    positions, colours = scene()
-    pyramid, inputs = pyramid_of(positions, found.config), torch.cat((positions, colours), dim=1)
-    assert torch.equal(found.eval()(pyramid, inputs), network(pyramid, inputs))
-    encoder = load_point_encoder(path)
-    assert (encoder.inputs, encoder.recipe) == (INPUTS, FACTS)
-    for one, two in zip(
-        encoder.encoder(pyramid, inputs), network.encoder(pyramid, inputs), strict=True
-    ):
-        assert torch.equal(one, two)
-
-
-def test_an_encoder_is_no_network(saved: Path) -> None:
-    with pytest.raises(FileFormatError, match="expected a whole network of splatseg, got an enc"):
-        load_point_network(saved)
 
 
 def test_what_cannot_be_saved(tmp_path: Path) -> None:
@@ -137,7 +108,7 @@ def test_the_shipped_one(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         load_point_encoder()
     assert str(caught.value) == (
         "none.safetensors: this installation has no weights of a point network; give the file of "
-        "a checkpoint: one of Open3D-ML's RandLA-Net, or of save_point_encoder."
+        "a checkpoint: one of Open3D-ML's RandLA-Net, or of scripts/train_point_network."
     )
     with pytest.raises(MissingFileError, match="other"):
         load_point_encoder(saved.with_name("other.safetensors"))
@@ -215,8 +186,8 @@ def about(metadata: dict[str, str], path: str, value: Any) -> None:
         (lambda m: about(m, "config.classes", 1e40), "config.classes: expected a whole number"),
         (lambda m: about(m, "config.ratios", [4]), "ratios: expected 3, one a level"),
         (
-            lambda m: about(m, "config.variant.slope", 7),
-            "config.variant.slope: expected a number of at most 1",
+            lambda m: about(m, "config.sum_slope", 7),
+            "config.sum_slope: expected a number of at most 1",
         ),
         (lambda m: about(m, "inputs", None), "about: inputs: expected an object, got None"),
         (
@@ -225,7 +196,7 @@ def about(metadata: dict[str, str], path: str, value: Any) -> None:
         ),
         (
             lambda m: m.update(format="x"),
-            "expected a RandLA-Net of splatseg, or tensors of a known",
+            "expected a RandLA-Net of splatseg, or tensors of Open3D-ML's",
         ),
     ],
 )
@@ -258,12 +229,10 @@ def saved_of_layouts(state: dict[str, Tensor], path: Path) -> Path:
 
 
 @pytest.mark.parametrize("inputs", [3, 6])
-@pytest.mark.parametrize("name", WRITERS)
-def test_features_are_those_of_its_program(name: str, inputs: int, tmp_path: Path) -> None:
-    writer = WRITERS[name]
-    state = state_dict(writer, inputs)
+def test_features_are_those_of_its_program(inputs: int, tmp_path: Path) -> None:
+    state = state_dict(inputs)
     found = load_point_encoder(saved_of_layouts(state, tmp_path / "a.pth"))
-    assert (found.layout, found.source, found.colour) == (name, "a.pth", inputs == 6)
+    assert (found.layout, found.source, found.colour) == ("open3d", "a.pth", inputs == 6)
     assert (found.config.first_width, found.config.widths) == (FIRST, WIDTHS)
     assert (found.config.neighbours, found.config.ratios) == (16, (4, 4, 4, 4))
     positions, colours = scene(120)
@@ -271,25 +240,21 @@ def test_features_are_those_of_its_program(name: str, inputs: int, tmp_path: Pat
     options = PyramidOptions(neighbours=3, ratios=(3, 2, 2, 2))
     pyramid = point_pyramid(positions, options=options, seed=2)
     fed = torch.cat((positions, colours), dim=1)[:, :inputs]
-    wanted = answer(writer, state, pyramid, fed)
+    wanted = answer(state, pyramid, fed)
     for one, two in zip(found.encoder(pyramid, fed), wanted, strict=True):
         assert np.abs(two).max() > 0.1
         np.testing.assert_allclose(one, two, rtol=2e-4, atol=2e-4)
 
 
 @pytest.mark.parametrize(
-    ("name", "inputs", "wanted"),
+    ("inputs", "wanted"),
     [
-        ("open3d", 6, PointInputs(grid_size=0.04, origin="floor", colour_range=255.0)),
-        ("open3d-2020", 3, PointInputs(grid_size=0.06)),
-        ("ari0u", 6, PointInputs(grid_size=0.04)),
-        ("tsunghan-wu", 3, PointInputs(grid_size=0.06)),
+        (6, PointInputs(grid_size=0.04, origin="floor", colour_range=255.0)),
+        (3, PointInputs(grid_size=0.06)),
     ],
 )
-def test_what_a_file_does_not_say_is_told(
-    name: str, inputs: int, wanted: PointInputs, tmp_path: Path
-) -> None:
-    path = saved_of_layouts(state_dict(WRITERS[name], inputs), tmp_path / "a.pth")
+def test_what_a_file_does_not_say_is_told(inputs: int, wanted: PointInputs, tmp_path: Path) -> None:
+    path = saved_of_layouts(state_dict(inputs), tmp_path / "a.pth")
     found = load_point_encoder(path)
     assert found.inputs == wanted
     assert found.assumed == ("neighbours", "ratios", "inputs")
@@ -298,27 +263,43 @@ def test_what_a_file_does_not_say_is_told(
     assert (found.inputs, found.assumed) == (said, ("neighbours", "ratios"))
 
 
+VERSION_0_1 = {
+    "distance": "euclidean", "second_encoding": "chained", "paired_features": "neighbour",
+    "sampling": "max", "start_slope": 0.2, "entry_slope": 0.2, "slope": 0.2, "sum_slope": 0.05,
+    "epsilon": 1e-6,
+}  # fmt: skip
+
+
+def test_files_of_version_0_1_are_read(saved: Path) -> None:
+    tensors, metadata = read_safetensors(saved)
+    about(metadata, "config.variant", VERSION_0_1)
+    write_tensors(tensors, saved, metadata=metadata)
+    assert load_point_encoder(saved).config.sum_slope == 0.05
+    about(metadata, "config.variant", VERSION_0_1 | {"distance": "squared"})
+    write_tensors(tensors, saved, metadata=metadata)
+    with pytest.raises(
+        FileFormatError, match=r"config\.variant: distance: expected one of the words"
+    ):
+        load_point_encoder(saved)
+
+
 def test_five_levels_are_those_of_rooms(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(state_dict.__module__ + ".WIDTHS", (4, 4, 4, 4, 4))
-    found = load_point_encoder(
-        saved_of_layouts(state_dict(WRITERS["open3d"], 6), tmp_path / "a.pth")
-    )
+    found = load_point_encoder(saved_of_layouts(state_dict(6), tmp_path / "a.pth"))
     assert found.config.ratios == (4, 4, 4, 4, 2)
 
 
 def test_ways_of_saving(tmp_path: Path) -> None:
-    """Tensors alone, safetensors, NumPy's, those of several GPUs, and an older name."""
-    state = state_dict(WRITERS["ari0u"], 6)
+    """Tensors alone, safetensors, NumPy's, and those of several GPUs."""
+    state = state_dict(6)
     plain = {name: value for name, value in state.items() if value.ndim}
     torch.save(state, tmp_path / "bare.pth")
     torch.save({"state_dict": state}, tmp_path / "lightning.ckpt")
     torch.save({f"module.{name}": value for name, value in state.items()}, tmp_path / "gpus.pth")
     write_tensors(state, tmp_path / "a.safetensors", metadata={"format": "pt"})
     np.savez(tmp_path / "a.npz", **{name: value.numpy() for name, value in plain.items()})
-    older = {name.replace("bn_start.0", "bn_start"): value for name, value in state.items()}
-    torch.save(older, tmp_path / "older.pth")
     wanted = load_point_encoder(tmp_path / "bare.pth").encoder.state_dict()
-    for name in ("lightning.ckpt", "gpus.pth", "a.safetensors", "a.npz", "older.pth"):
+    for name in ("lightning.ckpt", "gpus.pth", "a.safetensors", "a.npz"):
         found = load_point_encoder(tmp_path / name).encoder.state_dict()
         assert all(torch.equal(found[key], wanted[key]) for key in wanted), name
 
@@ -359,12 +340,15 @@ LAYER = "encoder.1.lse1.mlp.conv.weight"
             lambda s: s.update({"fc0.weight": torch.zeros(8, 4)}),
             "inputs: expected one of 3, 6, got 4.",
         ),
-        (lambda s: s.pop("fc0.weight"), "expected a RandLA-Net of splatseg, or tensors of a known"),
+        (
+            lambda s: s.pop("fc0.weight"),
+            "expected a RandLA-Net of splatseg, or tensors of Open3D-ML's",
+        ),
         (lambda s: s.clear(), "expected tensors by name or a state_dict, got none."),
     ],
 )
 def test_tensors_that_do_not_fit_of_layouts(change: Any, message: str, tmp_path: Path) -> None:
-    state = state_dict(WRITERS["open3d"], 6)
+    state = state_dict(6)
     change(state)
     path = saved_of_layouts(state, tmp_path / "a.pth")
     with pytest.raises(FileFormatError) as caught:

@@ -9,9 +9,9 @@ from splatseg.methods.cosseg.network import RandlaEncoder
 from splatseg.methods.cosseg.pyramid import (
     PyramidOptions,
     RandlaConfig,
-    join_pyramids,
     point_pyramid,
 )
+from splatseg_bench.point_network import join_pyramids
 
 from .point_scenes import pyramid_of, randomised, scene, small_config
 
@@ -163,10 +163,3 @@ def test_batches_that_do_not_fit() -> None:
         join_pyramids([one, two])
     with pytest.raises(InputError, match=r"got neighbours \[3\] and \[4\]"):
         join_pyramids([two, three])
-
-
-def test_a_pyramid_moves_to_a_device() -> None:
-    moved = pyramid_of(scene(40)[0], small_config()).to("meta")
-    assert moved.positions.device.type == "meta"
-    for name in ("kept", "neighbours", "pool", "up"):
-        assert {one.device.type for one in getattr(moved, name)} == {"meta"}

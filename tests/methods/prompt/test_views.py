@@ -10,7 +10,7 @@ from splatseg.core import View
 from splatseg.methods.prompt import initial_views, views
 from splatseg.methods.prompt.views import (
     lifted,
-    points_around,
+    neighbouring_points,
     points_inside,
     projected_views,
     view_positions,
@@ -134,14 +134,14 @@ def test_a_small_mask_has_few_points() -> None:
 
 
 def test_points_around_are_outside_and_spread(square) -> None:
-    points = points_around(square, 4)
+    points = neighbouring_points(square, 4)
     assert len(points) == 4
     pixels = points.long()
     assert not bool(square[pixels[:, 1], pixels[:, 0]].any())
     assert float(torch.pdist(points).min()) > 15
-    assert len(points_around(square, 0)) == 0
+    assert len(neighbouring_points(square, 0)) == 0
     # A mask that fills the picture has nothing around it.
-    assert len(points_around(torch.ones(8, 8, dtype=torch.bool), 4)) == 0
+    assert len(neighbouring_points(torch.ones(8, 8, dtype=torch.bool), 4)) == 0
 
 
 def faint_before_solid():

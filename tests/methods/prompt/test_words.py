@@ -14,10 +14,10 @@ from splatseg.io.evidence import TextEmbeddings
 from splatseg.lift import TextSpace
 from splatseg.lift.phrases import ThingLooks
 from splatseg.lift.vocabulary import Vocabulary
-from splatseg.lift.words import WordAnswers
+from splatseg.lift.words import WordMatches
 from splatseg.methods.prompt import PromptOptions, PromptSession, PromptSources, masks
 from splatseg.methods.prompt.masks import MaskTable, mask_table, painted
-from splatseg.methods.prompt.words import MaskAnswers, answering, linked, mask_groups
+from splatseg.methods.prompt.words import MaskMatches, answering, linked, mask_groups
 from support.red_square import SIZE, camera
 
 
@@ -242,7 +242,7 @@ def test_a_phrase_is_asked_by_its_parts(fruit) -> None:
     )
     for how, id in (("whole", APPLE), ("parts", PEAR)):
         options = PromptOptions(phrases=how, min_probability=0.0)
-        (found,) = MaskAnswers(table, vocabulary, options).find("green fruit")
+        (found,) = MaskMatches(table, vocabulary, options).find("green fruit")
         for view, rle in found.masks:
             assert torch.equal(rle.decode(), fruit.truth(view) == id), how
     with pytest.raises(InputError, match="phrases: expected one of parts, whole"):
@@ -295,7 +295,7 @@ def table_of_groups() -> MaskTable:
 def meant(
     table_of_groups: MaskTable, cosines: list[float], probabilities: list[float]
 ) -> int | None:
-    answers = WordAnswers(
+    answers = WordMatches(
         words=("mug",),
         cosines=torch.tensor(cosines * 2)[:, None],
         probabilities=torch.tensor(probabilities * 2)[:, None],

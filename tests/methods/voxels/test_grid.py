@@ -8,9 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from methods.voxels import reference
+from methods.voxels.grid_index import GridIndex
 from splatseg.core.voxels import VoxelGrid, cell_order
 from splatseg.errors import InputError, RangeError
-from splatseg.methods.voxels.grid import GridIndex, voxelise, voxelise_to_count
+from splatseg.methods.voxels.grid import voxelise, voxelise_to_count
 
 
 def grid_of(cells, *, size=1.0, origin=(0.0, 0.0, 0.0)) -> VoxelGrid:

@@ -48,7 +48,6 @@ def layer(scene) -> VoxelFeatures:
         {"cell": 0.5},
         {"filter": "opaque"},
         {"hits": "first"},
-        {"hits": "weights"},
         {"precision": "int8"},
         {"precision": "product"},
     ],

@@ -41,15 +41,11 @@ def _errors(room: PhotographedRoom, pairs, errors=None, seed: int = 0, **options
     return room.errors_of(aligned_cameras(room, found))
 
 
-@pytest.mark.parametrize("alignment", ["robust", "published"])
-def test_exact_pointmaps_give_exact_cameras(photographed, alignment) -> None:
-    exact = PointmapErrors(noise=0, warp=0)
-    steps = 100 if alignment == "published" else None
-    off = _errors(photographed, complete(8), exact, alignment=alignment, iterations=steps)
-    limit = 1e-3 if alignment == "robust" else 0.1
-    assert off.rotation.max() < limit
-    assert off.centre.max() < limit / 50
-    assert np.abs(off.focal).max() < limit / 50
+def test_exact_pointmaps_give_exact_cameras(photographed) -> None:
+    off = _errors(photographed, complete(8), PointmapErrors(noise=0, warp=0))
+    assert off.rotation.max() < 1e-3
+    assert off.centre.max() < 2e-5
+    assert np.abs(off.focal).max() < 2e-5
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
@@ -60,7 +56,7 @@ def test_cameras_of_wrong_pointmaps_with_a_tenth_of_outliers(photographed, seed)
     assert np.abs(off.focal).max() < 0.01
 
 
-def test_outliers_lose_their_weight_and_the_published_alignment_believes_them(photographed) -> None:
+def test_outliers_lose_their_weight(photographed) -> None:
     pairs = complete(8)
     named = [(photographed.names[i], photographed.names[j]) for i, j in pairs]
     wrong = photographed.answers(pairs, WRONG).outliers
@@ -70,9 +66,6 @@ def test_outliers_lose_their_weight_and_the_published_alignment_believes_them(ph
     found = solved(samples)
     assert float(found.weight[bad].max()) < 0.1
     assert float(found.weight[~bad].min()) > 0.3
-    published = _errors(photographed, pairs, WRONG, alignment="published", iterations=150)
-    robust = _errors(photographed, pairs, WRONG)
-    assert published.rotation.max() > 1.5 * robust.rotation.max()
 
 
 @pytest.mark.parametrize("bad", ["behind", "on a line"])

@@ -14,7 +14,6 @@ from splatseg.pose._pointmap_pixels import PairSamples, PhotographSize
 from splatseg.pose._pointmap_start import (
     agreement,
     average,
-    confidence_score,
     geman_mcclure,
     graph_solve,
     lens_focals,
@@ -164,7 +163,6 @@ def test_pairs_that_contradict_others_are_not_in_the_tree(photographed) -> None:
     samples.weights[bad] += 1
     geometry = pair_geometry(samples, lens_focals(samples))
     assert not bad[spanning_tree(samples, agreement(samples, geometry))].any()
-    assert bad[spanning_tree(samples, confidence_score(samples))].any()
 
 
 def test_a_tree_reaches_every_photograph_once(photographed) -> None:

@@ -343,7 +343,7 @@ def test_a_folder_tells_what_it_is_made_of_and_what_lacks(tmp_path):
     assert not goes_on(drive, tmp_path / "none")
     table = folder / "drive.json"
     table.write_text(json.dumps(json.loads(table.read_text()) | {"about": 3}))
-    with pytest.raises(FileFormatError, match="expected an object as about, got 3"):
+    with pytest.raises(FileFormatError, match="about: expected an object, got 3"):
         drive_about(folder)
 
 
@@ -380,17 +380,17 @@ def test_blocks_of_something_else_are_made_anew(change, tmp_path):
     ("changes", "words"),
     [
         ({"format": "scene"}, "expected a drive, got 'scene'"),
-        ({"version": 2}, "version 1, got 2"),
-        ({"blocks": 3}, "expected a list of blocks"),
+        ({"version": 2}, "version 1 or less, got version 2"),
+        ({"blocks": 3}, "blocks: expected a list, got 3"),
         ({"blocks": []}, "blocks: expected blocks that count from 0"),
         ({"blocks": [4]}, r"blocks\[0\]: expected an object"),
         ({"overlap": 0}, "overlap: expected a positive length"),
-        ({"reach": None}, "reach: expected a finite number"),
-        ({"start": "x"}, r"blocks\[0\]: start"),
+        ({"reach": None}, "reach: expected a number, got"),
+        ({"start": "x"}, r"blocks\[0\]\.start: expected a number"),
         ({"end": -1}, "start, end: expected a piece"),
-        ({"piece": []}, r"blocks\[0\]: piece: expected places of three numbers"),
-        ({"span": [[0, 0]]}, r"blocks\[0\]: span: expected places of three numbers"),
-        ({"span": [[0, 0, 1e99]]}, r"blocks\[0\]: span: expected a finite number"),
+        ({"piece": []}, r"blocks\[0\]\.piece: expected a list of length at least 1"),
+        ({"span": [[0, 0]]}, r"blocks\[0\]\.span\[0\]: expected a list of length 3"),
+        ({"span": [[0, 0, 1e99]]}, r"blocks\[0\]\.span\[0\]\[2\]: expected a finite number"),
     ],
 )
 def test_files_of_something_else_are_refused(changes, words, tmp_path):

@@ -12,7 +12,7 @@ from splatseg.core.scans import Scan
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.io.captures import read_capture
 from splatseg.io.scans import read_scans
-from splatseg.street.block_field import DriveScans, block_capture
+from splatseg.street.block_field import DriveScans, block_views
 from splatseg.street.blocks import DriveBlockOptions, DriveBlocks, cut_drive, frame_centres
 from street.blocks.support import NumberedScans, bend, crossing, straight
 
@@ -316,43 +316,31 @@ def capture_along(places: torch.Tensor, tmp_path, points: PointCloud | None = No
 def test_views_of_an_overlap_are_of_both_blocks(tmp_path):
     places = straight(200.0, step=2.0)
     capture, drive = capture_along(places, tmp_path), cut_drive(places)
-    parts = [block_capture(capture, drive, block) for block in drive.blocks]
-    found = [[int(view.name) * 2 for view in part.views] for part in parts]
+    parts = [block_views(capture.views, drive, block) for block in drive.blocks]
+    found = [[int(view.name) * 2 for view in part] for part in parts]
     # The overlap around 50 m is from 40 to 60, where weights reach 0.
     assert found[0] == list(range(0, 60, 2))
     assert found[1] == list(range(42, 110, 2))
     assert sorted({x for part in found for x in part}) == list(range(0, 201, 2))
-    assert {view.split for view in parts[0].views} == {"train", "test"}
+    assert {view.split for view in parts[0]} == {"train", "test"}
 
 
-def test_start_points_are_those_in_reach(tmp_path):
+def test_points_of_a_block_are_those_in_reach():
     x = torch.arange(-100.0, 300.0, 5.0)
-    cloud = PointCloud(
-        points=torch.stack((x, 0 * x, 0 * x), dim=1),
-        colours=(torch.arange(len(x)) % 256)[:, None].expand(-1, 3).byte(),
-    )
-    places = straight(200.0)
-    capture, drive = capture_along(places, tmp_path, cloud), cut_drive(places)
-    part = block_capture(capture, drive, drive.blocks[1])
-    assert part.points is not None
-    assert part.points.points[:, 0].tolist() == list(range(-20, 175, 5))
-    assert part.points.colours is not None
-    assert part.points.colours[0].tolist() == [16, 16, 16]
-    far = cut_drive(places, options=DriveBlockOptions(reach=30.0))
-    small = block_capture(capture, far, far.blocks[1])
-    assert small.points is not None
-    assert small.points.points[:, 0].tolist() == list(range(10, 145, 5))
-    assert block_capture(replace(capture, points=None), drive, drive.blocks[0]).points is None
+    points, places = torch.stack((x, 0 * x, 0 * x), dim=1), straight(200.0)
+    drive, far = cut_drive(places), cut_drive(places, options=DriveBlockOptions(reach=30.0))
+    near = drive.near(drive.blocks[1], points)
+    assert points[near, 0].tolist() == list(range(-20, 175, 5))
+    near = far.near(far.blocks[1], points)
+    assert points[near, 0].tolist() == list(range(10, 145, 5))
 
 
 def test_a_drive_of_one_block_is_the_capture(generated_drive):
     capture = read_capture(generated_drive)
     drive = cut_drive(frame_centres(capture.train_views))
-    part = block_capture(capture, drive, drive.blocks[0])
-    assert [view.name for view in part.views] == [view.name for view in capture.views]
-    assert part.points is not None
+    assert block_views(capture.views, drive, drive.blocks[0]) == capture.views
     assert capture.points is not None
-    assert torch.equal(part.points.points, capture.points.points)
+    assert drive.near(drive.blocks[0], capture.points.points).all()
     scans = read_scans(generated_drive)
     own, to_label = (
         f(drive.blocks[0]) for f in (DriveScans(scans, drive).of, DriveScans(scans, drive).to_label)
@@ -372,7 +360,7 @@ def test_a_block_without_training_views_is_refused(tmp_path):
     capture, drive = capture_along(places, tmp_path), cut_drive(places)
     views = [replace(v, split="test") if int(v.name) > 85 else v for v in capture.views]
     with pytest.raises(InputError, match=r"blocks: .* block 2 of 4 has none; longer blocks"):
-        block_capture(replace(capture, views=tuple(views)), drive, drive.blocks[2])
+        block_views(views, drive, drive.blocks[2])
 
 
 def test_scans_are_of_the_blocks_where_they_were_measured():

@@ -16,17 +16,17 @@ from splatseg.street.depth_views import (
     axis_cosines,
     capture_views,
     collect_rays,
-    distances_of,
     evidence_views,
     field_views,
     point_views,
     scan_views,
 )
-from splatseg.street.hits import PrimitiveCaster, enclosing, mesh_depth, mesh_distances
+from splatseg.street.hits import PrimitiveCaster, enclosing
 from splatseg.street.primitives import PrimitiveMesh
 from splatseg.street.shapes import template
 from support import brute_rays as reference
 from support.analytic import BallOverFloor
+from support.mesh_fields import mesh_depth, mesh_distances
 
 
 def camera(width: int = 3, height: int = 1, *, x: float = 0.0) -> Camera:
@@ -43,14 +43,10 @@ def seed(value: int = 0) -> torch.Generator:
 
 
 def test_distance_is_depth_over_the_cosine_of_the_ray() -> None:
-    """The plane z = 2: straight ahead 2, one pixel aside 2 sqrt(2)."""
-    view = DepthView(camera=camera(), depth=torch.full((1, 3), 2.0))
+    """Straight ahead 1, one pixel aside 1 / sqrt(2)."""
     root = math.sqrt(2)
-    assert distances_of(view)[0].tolist() == pytest.approx([2 * root, 2, 2 * root])
-    _, directions = view.camera.rays()
-    assert axis_cosines(view.camera, directions)[0].tolist() == pytest.approx(
-        [1 / root, 1, 1 / root]
-    )
+    _, directions = camera().rays()
+    assert axis_cosines(camera(), directions)[0].tolist() == pytest.approx([1 / root, 1, 1 / root])
 
 
 def test_a_turned_camera_measures_along_its_own_axis() -> None:
@@ -61,15 +57,10 @@ def test_a_turned_camera_measures_along_its_own_axis() -> None:
             [[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]]
         ),
     )  # fmt: skip
-    found = distances_of(DepthView(camera=turned, depth=torch.full((1, 3), 3.0)))
     origin, directions = turned.rays()
-    points = origin + directions * found[..., None].double()
+    found = 3.0 / axis_cosines(turned, directions)
+    points = origin + directions * found[..., None]
     assert points[0, :, 0].tolist() == pytest.approx([3, 3, 3])
-
-
-def test_unknown_depth_has_no_distance() -> None:
-    view = DepthView(camera=camera(), depth=torch.tensor([[0.0, 2, 0]]))
-    assert distances_of(view).tolist() == [[0, 2, 0]]
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -1.0])

@@ -24,13 +24,15 @@ from splatseg.street.geometry import (
     plane_errors,
     usable,
 )
-from splatseg.street.hits import MeshCaster, PrimitiveCaster, mesh_depth
+from splatseg.street.hits import MeshCaster, PrimitiveCaster
 from splatseg.street.primitives import Primitives, voxel_primitives
-from splatseg.street.shapes import ShapeConfig, new_shapes
+from splatseg.street.shapes import ShapeConfig
 from splatseg.synthetic import SyntheticScene, cast
 from splatseg_bench.worlds._recorded import drive_cameras
 from splatseg_bench.worlds._streets import street
+from support.mesh_fields import mesh_depth
 from support.primitives import shipped, sphere, spheres
+from support.shape_quality import new_shapes
 
 WALL, FLOOR = 6.0, 1.2
 

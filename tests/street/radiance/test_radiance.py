@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch import Tensor
 
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.street.hits import MeshCaster
@@ -12,7 +13,6 @@ from splatseg.street.radiance import (
     PUBLISHED_RADIANCE,
     RadianceModel,
     RadianceOptions,
-    composite,
     encode,
     encoded_size,
     ray_weights,
@@ -182,6 +182,11 @@ def test_options_that_cannot_be_are_refused(changes: dict[str, object]) -> None:
 
 
 # Compositing: eq. 5 by hand, against its readable twin, and by finite differences.
+
+
+def composite(opacity: Tensor, values: Tensor, background: Tensor) -> Tensor:
+    weights, passed = ray_weights(opacity)
+    return torch.einsum("nl,nlc->nc", weights, values) + passed[:, None] * background
 
 
 def test_two_samples_and_a_background_by_hand() -> None:

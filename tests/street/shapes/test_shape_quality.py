@@ -7,11 +7,12 @@ import pytest
 import torch
 
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.street.shapes import ShapeConfig, chamfer, new_shapes, primitive_scale, template
+from splatseg.street.shapes import ShapeConfig, chamfer, primitive_scale, template
 from support import shape_quality as intersections
 from support.shape_quality import (
     cut_patches,
     mesh_regularisers,
+    new_shapes,
     sample_faces,
     score_shapes,
     self_intersections,

@@ -15,14 +15,16 @@ from torch.nn import functional
 
 from splatseg.errors import FileFormatError, InputError, MissingFileError, RangeError, ShapeError
 from splatseg.io.tensors import write_tensors
-from splatseg.street.shape_files import SHIPPED, load_shapes, save_shapes
-from splatseg.street.shapes import ShapeAutoEncoder, ShapeConfig, new_shapes, sphere_code, template
+from splatseg.street.shape_files import SHIPPED, load_shapes
+from splatseg.street.shapes import ShapeAutoEncoder, ShapeConfig, sphere_code, template
 from splatseg_bench.worlds._recorded import surface_points
 from splatseg_bench.worlds._streets import street
 from splatseg_bench.worlds._varied_rooms import varied_room
 from support.shape_quality import (
     cut_patches,
     interpolate_codes,
+    new_shapes,
+    save_shapes,
     score_shapes,
     self_intersections,
     topology,
@@ -389,7 +391,7 @@ def test_ours_come_back_as_they_were(tmp_path: Path) -> None:
     ("old", "new", "words"),
     [
         ('"version":"1"', '"version":"2"', "expected version 1 of splatseg.street.shapes, got '2'"),
-        (r"\"code_size\"", r"\"code_sizo\"", "expected facts and a config of code_size"),
+        (r"\"code_size\"", r"\"code_sizo\"", "expected shape"),
         (r"\"code_size\": 4", r"\"code_size\": 1", r"code_size: expected a value in \[2, 4096\]"),
         (r"\"code_size\": 4", r"\"code_size\": 5", "expected shape"),
         (r"\"code_size\": 4", r"\"code_size\":[]", "code_size"),

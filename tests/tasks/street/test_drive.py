@@ -25,10 +25,10 @@ from splatseg.tasks import (
     StreetField,
     StreetOptions,
     label_scans,
-    made_street_field,
     make_street_field,
     open_drive,
     street_field,
+    street_field_of_scene,
 )
 from splatseg.tasks.street_drive import street_drive
 from splatseg.tasks.work import Work, scene_field
@@ -214,7 +214,7 @@ def test_blocks_are_asked_by_another_rule(both, generated_drive, tmp_path) -> No
     scans = read_scans(generated_drive)
     points = scans.scan(scans.scan_names[0]).points
     assert made.field.layer(LAYER).info.options["vertex_rule"] == "weighed"
-    field = made_street_field(
+    field = street_field_of_scene(
         scene, options=StreetOptions(block_length=20.0),
         field_options=DnmpOptions(vertex_rule="adjusted"),
     )  # fmt: skip
@@ -232,13 +232,13 @@ def test_what_was_stopped_goes_on_to_the_same_bytes(scene, quick, options) -> No
     first = (scene.root / "fields/street/0000.safetensors").stat()
     with pytest.raises(MissingFileError, match="all 2 blocks of the drive, 1 lack"):
         scene_field(scene, "street")
-    assert made_street_field(scene, options=options) is None
+    assert street_field_of_scene(scene, options=options) is None
     made = make_street_field(scene, options=options, field_options=QUICK)
     assert made.facts["blocks_made"] == 1
     assert (scene.root / "fields/street/0000.safetensors").stat().st_mtime_ns == first.st_mtime_ns
     assert contents(scene.root) == contents(quick)
     assert made.facts["primitives"] == sum(len(made.field._field(index).mesh) for index in range(2))
-    assert isinstance(made_street_field(scene, options=options), DriveField)
+    assert isinstance(street_field_of_scene(scene, options=options), DriveField)
 
 
 def test_a_new_scene_of_a_capture_is_gone_on_with(

@@ -13,7 +13,7 @@ from splatseg.errors import InputError
 from splatseg.io.evidence import create_evidence
 from splatseg.io.scans import read_scans
 from splatseg.io.scene import scene_field_names
-from splatseg.street.build import DnmpOptions, seen_shares
+from splatseg.street.build import DnmpOptions, visible_shares
 from splatseg.tasks import (
     EvaluationOptions,
     RenderingOptions,
@@ -24,16 +24,11 @@ from splatseg.tasks import (
     save_street_field,
     street_field,
 )
-from splatseg.tasks.street_inputs import DriveSources, drive_inputs, drive_sources
+from splatseg.tasks.street_inputs import drive_inputs, drive_sources
 from splatseg.tasks.work import Observer, Work, scene_field
 
 QUICK = DnmpOptions(voxels=(2.0, 4.0), geometry_iterations=1, iterations=3, rays=64)
 EVIDENCE = StreetOptions(evidence="labels_semantic")
-
-
-def sources_of(scene: Scene, views, **asked) -> DriveSources:
-    """The sources of an open scene."""
-    return drive_sources(Work(scene=scene, backend="cpu"), views, **asked)
 
 
 @pytest.fixture(scope="module")
@@ -139,14 +134,14 @@ def test_depth_comes_from_what_is_there(drive, generated_drive) -> None:
         ),
     }
     known: dict[str, list[torch.Tensor]] = {}
-    for kind, sources in found.items():
-        assert sources.said.endswith(f"depth of {kind}")
-        depths = list(sources.depths())
+    for kind, (_, read, said) in found.items():
+        assert said.endswith(f"depth of {kind}")
+        depths = list(read())
         assert [d.camera for d in depths] == [view.camera for view in bare]
-        assert len(list(sources.depths())) == 2
+        assert len(list(read())) == 2
         known[kind] = [view.depth for view in depths]
-    assert len(found["scans"].points) > len(found["points"].points) == 200
-    assert len(found["the Gaussians"].points) > 200
+    assert len(found["scans"][0]) > len(found["points"][0]) == 200
+    assert len(found["the Gaussians"][0]) > 200
     measured, both, shown = (known[kind] for kind in list(found)[:3])
     for one, filled, other in zip(measured, both, shown, strict=True):
         assert torch.equal(filled, torch.where(one > 0, one, other))
@@ -154,7 +149,7 @@ def test_depth_comes_from_what_is_there(drive, generated_drive) -> None:
     centres = drive_sources(
         Work(scene=full, backend="cpu"), bare, depth="points", scans=None, points=None, **asked
     )
-    assert "centres of Gaussians" in centres.said
+    assert "centres of Gaussians" in centres[2]
     for kind, words in {
         "scans": "expected scans to be given",
         "maps": "expected maps of the 2 views",
@@ -178,18 +173,18 @@ def test_maps_of_the_capture_give_depth_and_points(drive, tmp_path) -> None:
     steps = np.full((view.camera.height, view.camera.width), 3000, np.uint16)
     Image.fromarray(steps).save(tmp_path / "a.png")
     mapped = replace(view, depth=tmp_path / "a.png", depth_unit=0.001)
-    sources = drive_sources(
+    points, _, said = drive_sources(
         Work(scene=drive, backend="cpu"), [mapped], depth="auto", scans=None, points=None, cell=0.5
     )
-    assert sources.said.endswith("depth maps of the capture")
-    assert "points of depth" in sources.said
-    _, z = view.camera.project(sources.points)
+    assert said.endswith("depth maps of the capture")
+    assert "points of depth" in said
+    _, z = view.camera.project(points)
     torch.testing.assert_close(z, torch.full_like(z, 3.0), atol=0.3, rtol=0)
 
 
 def test_what_a_ray_saw_next_to_nothing_of_was_adjusted() -> None:
     """float16 holds no number so small; Adam moved the vertex by its whole rate all the same."""
-    shares = seen_shares(torch.tensor([0.0, 1e-30, 1e-7, 10.0, 1e9]))
+    shares = visible_shares(torch.tensor([0.0, 1e-30, 1e-7, 10.0, 1e9]))
     assert shares.tolist() == [0.0, 2.0**-24, 2.0**-24, 0.5, 1.0]
     assert torch.equal(shares, shares.half().float())
 

@@ -234,9 +234,10 @@ def test_every_source_of_depth_is_masked(scene, generated_drive, tmp_path) -> No
     scans = read_scans(generated_drive)
     cloud = torch.cat([scans.scan(name).points for name in scans.scan_names])
     for kind in ("maps", "depth_model", "scans", "points"):
-        (found,) = drive_sources(
+        _, depths, _ = drive_sources(
             opened(rooted), [masked], depth=kind, scans=scans, points=cloud, cell=0.5
-        ).depths()
+        )
+        (found,) = depths()
         half = found.depth.shape[1] // 2
         assert not bool(found.depth[:, :half].any()), kind
         assert bool(found.depth[:, half:].any()), kind

@@ -1,7 +1,6 @@
 """The page of a drive: of a field that was made, of blocks, and of points that were labelled."""
 
 import json
-import math
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -17,16 +16,14 @@ from splatseg.io.scans import read_scans
 from splatseg.report.maps import LabelledPoints
 from splatseg.report.words import spread
 from splatseg.street.build import DnmpOptions
-from splatseg.street.depth_views import DepthView
 from splatseg.street.field import MeshField
 from splatseg.tasks import ScanLabelOptions, StreetOptions, label_scans, open_drive, street_field
-from splatseg.tasks.street_field import KeptDepths, depth_errors
 from splatseg.tasks.street_report import (
     LabelledScans,
-    in_sight,
     point_scores,
     report_street,
     true_ids,
+    visibility_of_points,
 )
 from support.analytic import BallOverFloor
 from support.mesh_fields import balls, told_field
@@ -76,7 +73,7 @@ def test_a_field_and_its_points(made, scene, generated_drive, tmp_path) -> None:
     assert [row["kept"] for row in record["levels"]] == made.facts["primitives_by_level"]
     assert [row["side"] for row in record["levels"]] == [2.0, 4.0]
     assert all(row["started"] >= row["kept"] > 0 for row in record["levels"])
-    assert record["depth_error"]["after"] < record["depth_error"]["before"]
+    assert record["depth_error"]["last"] < record["depth_error"]["first"]
     assert set(record["psnr"]) <= {view.name for view in scene.train_views}
     assert len(record["psnr"]) == min(4, len(scene.train_views))
     assert record["points"]["points"] == labels.counts.points
@@ -109,10 +106,10 @@ def test_whose_views_and_depth_say_what_was_seen(made, scene, tmp_path) -> None:
     other = replace(scene.train_views[1], camera=camera(0.0), depth=None)
     known = replace(scene, views=(mapped, other))
     field = balls_field(views=(mapped.name,))
-    seen, whose = in_sight(known, field, "semantic", cloud)
+    seen, whose = visibility_of_points(known, field, "semantic", cloud)
     assert (seen.tolist(), whose) == ([True, True, False], "the capture's depth maps")
     field = balls_field(views=(mapped.name, other.name))
-    seen, whose = in_sight(known, field, "semantic", cloud)
+    seen, whose = visibility_of_points(known, field, "semantic", cloud)
     assert whose == "the depth that the field shows"
     assert seen.tolist() == [False, False, False], "its ball stands before them"
 
@@ -135,7 +132,7 @@ def test_a_field_that_was_there(made, scene) -> None:
     path = report_street(scene, made.field, layer="classes", name="other")
     record = json.loads(path.with_suffix(".json").read_text())
     assert path.name == "other.html"
-    assert (record["field"], record["levels"], record["depth"]) == (None, [], [])
+    assert (record["field"], record["levels"], record["depth_error"]) == (None, [], None)
     assert record["psnr"]
 
 
@@ -171,47 +168,6 @@ def camera(x: float) -> Camera:
     pose = torch.eye(4, dtype=torch.float64)
     pose[0, 3] = -x
     return Camera(width=40, height=30, fx=40.0, fy=40.0, cx=20, cy=15, cam_from_world=pose)
-
-
-def wall(x: float, distance: float, *, scale: int = 1) -> DepthView:
-    """A wall before a camera, seen in a part of its pixels."""
-    depth = torch.full((30 // scale, 40 // scale), distance)
-    depth[:, 0] = 0
-    return DepthView(camera=camera(x).resized(40 // scale, 30 // scale), depth=depth)
-
-
-def test_depth_of_a_few_views_is_kept_as_it_goes_by() -> None:
-    views = [View(name=f"v{i}", camera=camera(i)) for i in range(12)]
-    depths = [wall(i, 4.0, scale=2) for i in range(12) if i != 4]
-    kept = KeptDepths(iter(depths), views)
-    assert list(kept) == depths, "none is changed"
-    assert [sample.view for sample in kept.samples] == ["v0", "v2", "v6", "v8", "v10"]
-    sample = kept.samples[1]
-    assert sample.origin.tolist() == [2, 0, 0]
-    assert len(sample.distances) == 15 * 19
-    ends = sample.origin + sample.directions.double() * sample.distances[:, None]
-    torch.testing.assert_close(ends[:, 2], torch.full((285,), 4.0).double(), atol=1e-5, rtol=0)
-    nothing = DepthView(camera=camera(0), depth=torch.zeros(30, 40))
-    empty = KeptDepths([nothing], views)
-    assert len(list(empty)) == 1
-    assert empty.samples == []
-
-
-def test_errors_are_medians_over_what_rays_meet() -> None:
-    """A ball of radius 1 m whose front is 3 m away, then 3.5 m; the wall is at 4 m."""
-    views = [View(name="v", camera=camera(0))]
-    kept = KeptDepths([wall(0, 2.0)], views)
-    list(kept)
-    near, far = balls([[0, 0, 2.0]], radius=0.5), balls([[0, 0, 2.25]], radius=0.5)
-    (row,) = depth_errors(kept.samples, near, far, metres_per_unit=2.0)
-    assert (row.view, row.rays) == ("v", 30 * 39)
-    assert 0 < row.met_after < row.met_before < 0.5
-    assert 0.5 < row.before < 1.0, "0.5 units before the wall in the middle, less at the rim"
-    assert row.after < row.before
-    (none,) = depth_errors(kept.samples, balls([]), far, metres_per_unit=1.0)
-    assert (none.before, none.met_before) == (None, 0)
-    assert none.after is not None
-    assert math.isfinite(none.after)
 
 
 def test_views_are_spread() -> None:

@@ -19,7 +19,7 @@ from torch import Tensor
 from splatseg.core.json_values import json_integer, json_number
 from splatseg.errors import FileFormatError, MissingFileError, quoted
 from splatseg.io.captures import find_formats
-from splatseg.io.foreign import made_from
+from splatseg.io.foreign import derived_from
 from splatseg.io.json_files import read_json
 from splatseg.io.limits import check_unpacked
 from splatseg_bench.layouts._reading import (
@@ -181,7 +181,7 @@ def _scene(path: Path) -> BenchmarkScene:
             of_view[view.name] = _mask(frame, category, view.name)
     if not truth:
         raise FileFormatError(f"{labels}: expected labels with objects, got none in any.")
-    with made_from(labels):
+    with derived_from(labels):
         tasks = tuple(
             TargetTask(name=category, truth=tuple(masks.values()), words=category)
             for category, masks in sorted(truth.items())

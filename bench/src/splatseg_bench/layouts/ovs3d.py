@@ -8,7 +8,7 @@ from pathlib import Path
 from splatseg.core import View
 from splatseg.errors import InputError, MissingFileError
 from splatseg.io.captures import find_formats
-from splatseg.io.foreign import made_from, read_lines
+from splatseg.io.foreign import derived_from, read_lines
 from splatseg.io.images import find_images
 from splatseg_bench.layouts._reading import (
     ViewsByFile,
@@ -76,7 +76,7 @@ def _scene(path: Path) -> BenchmarkScene:
             raise MissingFileError(
                 f"{path / _TRUTH}: expected a mask {name}.png of some view, got none."
             )
-    with made_from(listed):
+    with derived_from(listed):
         tasks = tuple(
             TargetTask(name=name, truth=tuple(masks), words=name) for name, masks in truth.items()
         )

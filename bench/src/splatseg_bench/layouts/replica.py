@@ -13,7 +13,7 @@ from splatseg.core.json_values import json_integer
 from splatseg.errors import FileFormatError, InputError, MissingFileError, quoted
 from splatseg.io.captures import find_formats
 from splatseg.io.captures.pose_tables import SEQUENCE, find_replica
-from splatseg.io.foreign import made_from
+from splatseg.io.foreign import derived_from
 from splatseg.io.images import find_images
 from splatseg.io.json_files import read_json
 from splatseg_bench.layouts._reading import (
@@ -221,5 +221,5 @@ def _table(content: Mapping[str, Any], key: str, name: str, path: Path) -> Class
             raise InputError(f"{where}: expected a {name}, got {quoted(word)}.")
         if id > 0:  # 0 is none in maps
             named.setdefault(id, word)
-    with made_from(path):
+    with derived_from(path):
         return ClassTable(rows=tuple(ClassInfo(id=id, name=word) for id, word in named.items()))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from splatseg.core import UNLABELLED, ClassInfo, ClassTable, Labels
 from splatseg.errors import FileFormatError, MissingFileError, quoted
 from splatseg.io.captures.nerfstudio import find_scannetpp
-from splatseg.io.foreign import made_from, reading
+from splatseg.io.foreign import derived_from, reading
 from splatseg.io.json_files import read_json
 from splatseg.io.ply import read_ply_vertices, vertex_positions
 from splatseg.io.surfaces import read_triangles
@@ -84,7 +84,7 @@ def read_annotated_points(scans: Path) -> TruePoints:
     ):
         if size:
             ids[np.isin(segments, members)] = names.index(name) + 1
-    with made_from(scans / _ANNOTATION):
+    with derived_from(scans / _ANNOTATION):
         rows = tuple(ClassInfo(id=i, name=name) for i, name in enumerate(names, start=1))
     return TruePoints(
         points=torch.from_numpy(np.ascontiguousarray(points, np.float32)),

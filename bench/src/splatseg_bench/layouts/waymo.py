@@ -26,7 +26,7 @@ from splatseg.io.captures.waymo import (
     photograph_name,
     read_waymo,
 )
-from splatseg.io.foreign import made_from, reading
+from splatseg.io.foreign import derived_from, reading
 from splatseg.io.limits import check_unpacked
 from splatseg.io.parquet import RowReader, bytes_of, integer_of, read_rows
 from splatseg.io.scans.waymo import find_waymo_scans, labelled_scans, read_waymo_scans
@@ -177,7 +177,7 @@ def _points(segment: WaymoSegment) -> TruePoints | None:
     if not labelled:
         return None
     ids = torch.cat([scan.labels["semantic"] for scan in labelled])
-    with made_from(path):
+    with derived_from(path):
         return TruePoints(
             points=torch.cat([scan.points.float() for scan in labelled]),
             labels=Labels(ids=ids, confidence=torch.ones(len(ids))),

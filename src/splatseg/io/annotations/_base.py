@@ -22,7 +22,7 @@ from splatseg.errors import InputError, quoted
 from splatseg.io.annotations._regions import Canvas, Region, merged
 from splatseg.io.evidence import Evidence
 from splatseg.io.evidence._base import MAX_FILE_ID
-from splatseg.io.foreign import expect, made_from, malformed
+from splatseg.io.foreign import derived_from, expect, malformed
 
 AreaKind = Literal["masks", "labels", "panoptic"]
 """What areas can be given as."""
@@ -202,7 +202,7 @@ def classes_of_names(names: Iterable[str], *, where: str) -> tuple[dict[str, int
     ids = {name: i for i, name in enumerate(dict.fromkeys(names), start=1)}
     few = len(ids) <= MAX_FILE_ID
     expect(few, where, f"at most {MAX_FILE_ID} labels, got {len(ids)}")
-    with made_from(where):
+    with derived_from(where):
         return ids, ClassTable(rows=tuple(ClassInfo(id=i, name=n) for n, i in ids.items()))
 
 

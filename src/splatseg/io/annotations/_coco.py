@@ -26,7 +26,7 @@ from splatseg.io.annotations._base import AnnotatedPicture, Annotations, renumbe
 from splatseg.io.annotations._regions import Canvas, Region, corners_of
 from splatseg.io.atomic import path_inside
 from splatseg.io.evidence._masks import RunLengths
-from splatseg.io.foreign import expect, is_folder, made_from, malformed, reading
+from splatseg.io.foreign import derived_from, expect, is_folder, malformed, reading
 from splatseg.io.images import open_image
 from splatseg.io.limits import check_unpacked
 from splatseg.io.schema import Name, Side, Whole, structured
@@ -244,7 +244,7 @@ def _panoptic_regions(
     where = canvas.where
     for row in rows:
         name = structured(row.file_name, _PngName, where=f"{where}: file_name")  # pyright: ignore[reportArgumentType]
-        with made_from(where):
+        with derived_from(where):
             png = path_inside(folder, str(name), make=False)
         codes = _png_codes(png, canvas)
         order = np.argsort(codes, axis=None, kind="stable")
@@ -292,7 +292,7 @@ def _categories(dataset: _Dataset, used: Sequence[int | None], path: Path) -> _C
     listed = dataset.categories
     infos = {row.id: row for row in listed}
     ids, back = renumbered(infos if listed else (id for id in used if id is not None))
-    with made_from(path):
+    with derived_from(path):
         rows = (
             ClassInfo(id=ids[id], name=row.name, isthing=bool(row.isthing))
             for id, row in sorted(infos.items())

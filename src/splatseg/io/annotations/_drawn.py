@@ -1,6 +1,6 @@
 """Shapes that were drawn in a tool: CVAT for images 1.1, labelme, Label Studio.
 
-CVAT has one XML of all pictures, read piece by piece. Runs of a mask go row by row through its box,
+CVAT has one XML of all pictures. Runs of a mask go row by row through its box,
 the first one outside.
 
     <annotations>
@@ -49,9 +49,10 @@ from splatseg.io.json_files import read_json
 from splatseg.io.limits import check_unpacked
 from splatseg.io.schema import Side, structured
 from splatseg.io.text_numbers import numbers_of
-from splatseg.io.xml_files import read_xml
+from splatseg.io.xml_files import xml_elements
 
 _CVAT = "CVAT for images 1.1"
+_AREAS = ("polygon", "mask")
 _OTHERS = {
     "box": "boxes", "cuboid": "cuboids", "ellipse": "ellipses", "points": "points",
     "polyline": "polylines", "skeleton": "skeletons",
@@ -94,19 +95,29 @@ def cvat_annotations(path: Path) -> Annotations:
         MissingFileError: If there is no such file.
         FileFormatError: If it is another XML, ends early or has a document type.
     """
-    found = _CvatReader(path)
-    for _ in read_xml(path, _CVAT, found):
-        pass  # all shapes are needed before the first picture: labels are numbered by them
-    used = sorted({shape.get("label", "") for _, shapes in found.images for _, shape in shapes})
-    ids, classes = classes_of_names([n for n in (*found.labels, *used) if n], where=str(path))
+    labels: list[str] = []
+    images: list[tuple[_CvatImage, list[tuple[str, Mapping[str, str]]]]] = []
+    left_out = Counter[str]()
+    hint = "; boxes of Pascal VOC do not say which pixels are inside, so export masks, or polygons "
+    for element in xml_elements(path, _CVAT, "annotations", hint=f"{hint}as COCO"):
+        what = "export the task as 'CVAT for images 1.1' or 'COCO 1.0'"
+        expect(element.tag != "track", path, f"{_CVAT}, got CVAT for video; {what}")
+        labels += [one.text.strip() for one in element.iterfind(".//labels/label/name") if one.text]
+        if element.tag == "image":
+            where = f"{path}: image {len(images)}"
+            image = structured(element.attrib, _CvatImage, where=where, strict=False)
+            images.append((image, [(x.tag, x.attrib) for x in element if x.tag in _AREAS]))
+            left_out.update(_OTHERS[one.tag] for one in element if one.tag in _OTHERS)
+    used = sorted({shape.get("label", "") for _, shapes in images for _, shape in shapes})
+    ids, classes = classes_of_names([n for n in (*labels, *used) if n], where=str(path))
     pictures = [
         AnnotatedPicture(
             name=image.name, path=path, size=(image.height, image.width),
             regions=partial(_cvat_regions, shapes, ids),
         )
-        for image, shapes in found.images
+        for image, shapes in images
     ]  # fmt: skip
-    return Annotations(path=path, pictures=pictures, classes=classes, left_out=found.left_out)
+    return Annotations(path=path, pictures=pictures, classes=classes, left_out=left_out)
 
 
 def _cvat_regions(
@@ -137,52 +148,6 @@ def _cvat_mask(shape: _CvatShape, canvas: Canvas) -> NDArray[np.bool_]:
     fits = inside and total == width * height
     expect(fits, canvas.where, f"{what}, got {total} pixels for one of {width}x{height}")
     return np.repeat(np.arange(len(runs)) % 2 == 1, runs).reshape(height, width)
-
-
-class _CvatReader:
-    """What Expat tells of a file: labels, and the shapes of each picture."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._names: list[str] = []
-        self._label: list[str] = []
-        self.labels: list[str] = []
-        self.images: list[tuple[_CvatImage, list[tuple[str, Mapping[str, str]]]]] = []
-        self.left_out: Counter[str] = Counter()
-
-    def start(self, name: str, attributes: dict[str, str]) -> None:
-        self._names.append(name)
-        hint = (
-            "boxes of Pascal VOC do not say which pixels are inside, so export masks, or polygons"
-        )
-        root = f"{_CVAT}, got XML of {quoted(name)}; {hint} as COCO"
-        expect(self._names[0] == "annotations", self._path, root)
-        depth = len(self._names)
-        hint = "export the task as 'CVAT for images 1.1' or 'COCO 1.0'"
-        video = depth == 2 and name == "track"
-        expect(not video, self._path, f"{_CVAT}, got CVAT for video; {hint}")
-        if depth == 2 and name == "image":
-            where = f"{self._path}: image {len(self.images)}"
-            image = structured(attributes, _CvatImage, where=where, strict=False)
-            self.images.append((image, []))
-        elif depth == 3 and self._names[1] == "image":
-            if name in ("polygon", "mask"):
-                self.images[-1][1].append((name, attributes))
-            elif name in _OTHERS:
-                self.left_out[_OTHERS[name]] += 1
-
-    def end(self, name: str) -> None:
-        if self._is_label_name():
-            self.labels.append("".join(self._label).strip())
-            self._label = []
-        self._names.pop()
-
-    def text(self, text: str) -> None:
-        if self._is_label_name():
-            self._label.append(text)
-
-    def _is_label_name(self) -> bool:
-        return self._names[-3:] == ["labels", "label", "name"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -328,17 +293,8 @@ class _Task:
 
 def is_label_studio(content: object) -> bool:
     """Whether a JSON value is a list of tasks."""
-    return _first_has(content, "data", "annotations")
-
-
-def is_label_studio_min(content: object) -> bool:
-    """Whether a JSON value is the shortened export, which has no sizes of masks."""
-    return _first_has(content, "annotation_id", "lead_time")
-
-
-def _first_has(content: object, *keys: str) -> bool:
     first: object = content[0] if isinstance(content, list) and content else None
-    return isinstance(first, dict) and all(key in first for key in keys)
+    return isinstance(first, dict) and "data" in first and "annotations" in first
 
 
 def label_studio_annotations(path: Path, content: object) -> Annotations:

@@ -1,9 +1,8 @@
 """Tells which tool wrote a file or folder of annotations, and opens it; or says what to export."""
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from splatseg.core import View
 from splatseg.core.boundary import boundary
@@ -19,7 +18,6 @@ from splatseg.io.annotations._coco import (
 from splatseg.io.annotations._drawn import (
     cvat_annotations,
     is_label_studio,
-    is_label_studio_min,
     is_labelme,
     label_studio_annotations,
     labelme_annotations,
@@ -38,20 +36,15 @@ _TABLE_FILES = ("labelmap.txt", "label_colors.txt")
 _OPENED = frozenset({".json", ".npy", ".npz", ".png", ".tif", ".tiff", ".xml"})
 """Suffixes of files that hold evidence of some kind."""
 
-_ADVICE = {
-    ".zip": "unpack it and give the folder",
-    ".pkl": "save masks as COCO run lengths in JSON (nothing is unpickled)",
-    ".pickle": "save masks as COCO run lengths in JSON (nothing is unpickled)",
-    ".pth": "give coco_instances_results.json instead, which Detectron2 writes beside it",
-    ".pt": "save masks as COCO run lengths in JSON (nothing is unpickled)",
-    ".csv": "export JSON, COCO or CVAT for images, which hold the masks",
-    ".tsv": "export JSON, COCO or CVAT for images, which hold the masks",
-    ".txt": "YOLO's text names no pixels of a picture; export COCO with segmentation",
-    ".h5": "save an npz with masks, or PNG label maps, one file a view",
-    ".mat": "save an npz with masks, or PNG label maps, one file a view",
-}
-"""What to give instead, by the suffix of what is not read."""
+_FOREIGN = frozenset(
+    {".zip", ".pkl", ".pickle", ".pth", ".pt", ".csv", ".tsv", ".txt", ".h5", ".mat"}
+)
+"""Suffixes in which annotations come that are not read."""
 
+_NOT_READ = (
+    "files are not read; export COCO, CVAT for images, labelme, Label Studio's JSON or PNG label "
+    "maps (docs/models.md has a table)"
+)
 _OF_ONE_VIEW = frozenset({".npy", ".npz", ".png", ".tif", ".tiff"})
 _TABLES = frozenset({HEADER_FILE, "segments.json", "tracks.json", "legend.json", "metadata.json"})
 _WHOLE = "annotations"
@@ -105,14 +98,14 @@ def _of_file(path: Path) -> Annotations:
         if found is None:
             raise FileFormatError(
                 f"{path}: expected annotations (COCO, Label Studio, labelme), got another JSON; "
-                "masks of one view are read with the folder of all views, VIEW.json each."
+                "masks of one view are read with the folder of all views, VIEW.json each, and "
+                "docs/models.md says what other tools export."
             )
         return found
     what = "a folder with a file a view, or annotations of all views in one JSON or XML, got one "
     what += f"{suffix} file; give the folder"
     expect(suffix not in _OF_ONE_VIEW, path, what, error=InputError)
-    advice = _ADVICE.get(suffix, "docs/models.md has a table of what is read")
-    raise InputError(f"{path}: annotations in {suffix or 'such'} files are not read: {advice}.")
+    raise InputError(f"{path}: annotations in {suffix or 'such'} {_NOT_READ}.")
 
 
 def _of_folder(folder: Path) -> Annotations | None:
@@ -125,8 +118,12 @@ def _of_folder(folder: Path) -> Annotations | None:
         deeper = sorted(p for p in folder.rglob("*.json") if p.name not in _TABLES)
         if deeper and is_labelme(read_json_value(deeper[0])):
             return labelme_annotations(folder, deeper)
-        if not deeper:
-            _advise(folder)
+        # A folder of nothing but files that are known and not read.
+        suffixes = set() if deeper else {p.suffix.lower() for p in folder.rglob("*") if p.is_file()}
+        foreign = sorted(suffixes & _FOREIGN) if suffixes.isdisjoint(_OPENED) else []
+        what = f"{folder}: annotations in {', '.join(foreign)} {_NOT_READ}."
+        if foreign:
+            raise InputError(what)
         return None
     # Label maps lie beside tables of their own; only a file of segments means them.
     if not whole and any(folder.glob("*.png")):
@@ -142,60 +139,30 @@ def _of_folder(folder: Path) -> Annotations | None:
     results = [path for path, content in contents.items() if is_results(content)]
     if results:
         return _results(_only(results), contents)
-    known = [p for p, content in contents.items() if any(tool.tells(content) for tool in _TOOLS)]
+    known = [p for p, content in contents.items() if any(tells(content) for tells, _ in _TOOLS)]
     if not known:
         return None
     path = _only(sorted(known))
     return _of_json(path, contents[path])
 
 
-class _Tool(NamedTuple):
-    """How the JSON of a tool is told, and read or refused."""
-
-    tells: Callable[[object], bool]
-    read: Callable[[Path, Any], Annotations]
-
-
-def _refuse(words: str, path: Path, _: Any) -> Annotations:
-    raise FileFormatError(f"{path}: expected {words}.")
-
-
 def _labelme_file(path: Path, _: Any) -> Annotations:
     return labelme_annotations(path, [path])
 
 
-def _is_datumaro(content: object) -> bool:
-    return isinstance(content, dict) and "items" in content and "categories" in content
-
-
-_TOOLS = (
-    _Tool(
-        is_label_studio_min,
-        partial(
-            _refuse, "Label Studio's JSON, got JSON-MIN, which lacks the tasks; export JSON or COCO"
-        ),
-    ),
-    _Tool(is_label_studio, label_studio_annotations),
-    _Tool(is_dataset, coco_dataset),
-    _Tool(is_labelme, _labelme_file),
-    _Tool(
-        _is_datumaro,
-        partial(
-            _refuse,
-            "annotations, got datumaro's own format; export COCO, CVAT or Pascal VOC segmentation "
-            "(datum convert -f coco_instances)",
-        ),
-    ),
+_TOOLS: tuple[tuple[Callable[[object], bool], Callable[[Path, Any], Annotations]], ...] = (
+    (is_label_studio, label_studio_annotations),
+    (is_dataset, coco_dataset),
+    (is_labelme, _labelme_file),
 )
-"""In the order in which they are looked for."""
+"""How the JSON of a tool is told and read, in the order in which they are looked for."""
 
 
 def _of_json(path: Path, content: Any) -> Annotations | None:
     if is_results(content):
         beside = {p: read_json_value(p) for p in sorted(path.parent.glob("*.json")) if p != path}
         return _results(path, beside | {path: content})
-    tool = next((tool for tool in _TOOLS if tool.tells(content)), None)
-    return None if tool is None else tool.read(path, content)
+    return next((read(path, content) for tells, read in _TOOLS if tells(content)), None)
 
 
 def _results(path: Path, contents: dict[Path, Any]) -> Annotations:
@@ -221,16 +188,6 @@ def _only(files: Sequence[Path]) -> Path:
             f"({names}{more}): give the one that is meant."
         )
     return files[0]
-
-
-def _advise(folder: Path) -> None:
-    """Refuse a folder of nothing but files that are known and not read."""
-    suffixes = {path.suffix.lower() for path in folder.rglob("*") if path.is_file()}
-    if suffixes.isdisjoint(_OPENED):
-        for suffix in sorted(suffixes & _ADVICE.keys()):
-            raise InputError(
-                f"{folder}: annotations in {suffix} files are not read: {_ADVICE[suffix]}."
-            )
 
 
 def picture_tables(folder: Path) -> tuple[Path, ...]:

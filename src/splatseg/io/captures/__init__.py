@@ -6,7 +6,7 @@ descriptions the first of the table wins. A layout more is a row more.
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 from splatseg._check import check_choice
 from splatseg.core import Capture, PointCloud
@@ -17,16 +17,7 @@ from splatseg.io.captures import pose_tables as tables
 from splatseg.io.captures.points import Metadata as Metadata
 from splatseg.io.captures.points import finite_points, read_ply_points
 from splatseg.io.captures.points import read_metadata as read_metadata
-from splatseg.io.captures.waymo_tfrecord import ENDING
 from splatseg.io.images import find_images
-
-
-class Reader(Protocol):
-    """Reads a capture of one layout."""
-
-    def __call__(self, path: Path, /, *, strict: bool) -> Capture:
-        """The capture at a path."""
-        ...
 
 
 class _Layout(NamedTuple):
@@ -36,7 +27,9 @@ class _Layout(NamedTuple):
     find: Callable[[Path], object]
     """Whether a folder is one: anything that counts as true."""
 
-    read: Reader
+    read: Callable[..., Capture]
+    """Takes the path, and `strict`."""
+
     files: tuple[str, ...] = ()
     """Names of files, beside others of the capture, that may stand for its folder."""
 
@@ -63,7 +56,7 @@ LAYOUTS = (
     _Layout("scannet", tables.find_scannet, tables.read_scannet),
     _Layout("scannetpp", nerfstudio.find_scannetpp, nerfstudio.read_scannetpp),
     _Layout("kitti360", kitti360.find_kitti360, kitti360.read_kitti360),
-    _Layout("waymo", waymo.find_waymo, waymo.read_waymo, suffixes=(waymo.SUFFIX, ENDING)),
+    _Layout("waymo", waymo.find_waymo, waymo.read_waymo, suffixes=(waymo.SUFFIX, waymo.OLD_SUFFIX)),
 )
 """Layouts that are read, in the order in which they are looked for."""
 

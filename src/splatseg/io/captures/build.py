@@ -18,7 +18,7 @@ from splatseg.errors import InputError, MissingFileError, quoted
 from splatseg.io.atomic import check_utf8
 from splatseg.io.captures.points import finite_points, read_metadata
 from splatseg.io.captures.raw_views import RawView, camera_of, intrinsics_of_size, scaled_to
-from splatseg.io.foreign import expect, is_file, is_folder, made_from
+from splatseg.io.foreign import derived_from, expect, is_file, is_folder
 from splatseg.io.images import DEFAULT_LONGEST, IMAGE_SUFFIXES, image_size, reduced_size, same_shape
 
 TEST_EVERY = 8
@@ -171,7 +171,7 @@ def build_capture(
     """
     expect(raw, path, f"photographs with poses, got a {format} capture of none", error=InputError)
     raw, found_notes = _located(path, raw)
-    with made_from(path):
+    with derived_from(path):
         names = view_names([view.relative for view in raw])
     order = sorted(range(len(raw)), key=lambda i: names[i])
     missing = tuple(raw[i].relative for i in order if not is_file(raw[i].image))
@@ -183,7 +183,7 @@ def build_capture(
     used = [raw[i] for i in order]
     _check_files(path, used)
     splits, split_note = _splits(used)
-    with made_from(path):
+    with derived_from(path):
         views = [
             View(
                 name=names[i],
@@ -201,7 +201,7 @@ def build_capture(
     if points is not None:
         points, point_notes = finite_points(points, where=path, strict=strict)
     found = (*left_out, *found_notes, *camera_notes, *point_notes, *notes, *split_note)
-    with made_from(path):
+    with derived_from(path):
         return Capture(
             path=path,
             format=format,
@@ -288,14 +288,14 @@ def _cameras(
             fault = "have a mask that cannot be opened or is of another shape"
             mask = _mask_size(view, size)
             fault = "have a pose or a lens that no camera has"
-            with made_from(where := f"{path}: {view.relative}"):
+            with derived_from(where := f"{path}: {view.relative}"):
                 cameras[i] = camera_of(view, intrinsics, size, where=where)
         except InputError as error:
             unfit.setdefault(fault, []).append(view.relative)
             first = first or error
             continue
         for what, (width, height) in (
-            ("intrinsics", (written.width or size[0], written.height or size[1])),
+            ("intrinsics", written.size or size),
             ("masks", mask),
         ):
             if (width, height) != size:

@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,15 +95,8 @@ class ColmapImage:
     cam_from_world: NDArray[np.float64]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ColmapFrame:
-    """One moment of a rig and the images taken at it."""
-
-    rig_id: int
-    rig_from_world: NDArray[np.float64]
-
-    images: tuple[tuple[int, int], ...]
-    """Pairs of camera id and image id."""
+ColmapFrame = tuple[int, NDArray[np.float64], tuple[tuple[int, int], ...]]
+"""One moment of a rig: its id, rig_from_world, and pairs of camera id and image id."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -192,13 +185,10 @@ def intrinsics_of(camera: ColmapCamera, *, where: str) -> Intrinsics:
     cx, cy, *distortion = values[lens.focals :]
     return Intrinsics(
         model=lens.model,
-        fx=values[0],
-        fy=values[lens.focals - 1],
-        cx=cx,
-        cy=cy,
+        focal=(values[0], values[lens.focals - 1]),
+        centre=(cx, cy),
         distortion=tuple(distortion),
-        width=camera.width,
-        height=camera.height,
+        size=(camera.width, camera.height),
     )
 
 
@@ -212,48 +202,24 @@ def poses_of(model: ColmapModel, *, where: str) -> dict[int, NDArray[np.float64]
         InputError: If a frame names a rig, a camera or an image that the model does not have.
     """
     poses = {id: image.cam_from_world for id, image in model.images.items()}
-    for frame in model.frames:
-        rig = model.rigs.get(frame.rig_id)
+    for rig_id, rig_from_world, images in model.frames:
+        rig = model.rigs.get(rig_id)
         if rig is None:
-            raise InputError(f"{where}: a frame names rig {frame.rig_id}, which is not there.")
-        for camera_id, image_id in frame.images:
+            raise InputError(f"{where}: a frame names rig {rig_id}, which is not there.")
+        for camera_id, image_id in images:
             if image_id not in poses:
                 # An image of the frame that was not registered has no row of its own.
                 continue
             if camera_id not in rig:
                 raise InputError(
                     f"{where}: image {image_id} was taken by camera {camera_id}, whose place in "
-                    f"rig {frame.rig_id} is not known."
+                    f"rig {rig_id} is not known."
                 )
-            poses[image_id] = rig[camera_id] @ frame.rig_from_world
+            poses[image_id] = rig[camera_id] @ rig_from_world
     return poses
 
 
-class _Source(Protocol):
-    """Fields of records, one after another, of a binary file or a line of text."""
-
-    def take(self, codes: str) -> tuple[float, ...]:
-        """Numbers by the codes of `struct`."""
-        ...
-
-    def lens(self) -> tuple[str, tuple[float, ...]]:
-        """Model, width, height and parameters of a camera: name, and numbers."""
-        ...
-
-    def is_camera(self) -> bool:
-        """Whether the sensor whose type comes next is a camera."""
-        ...
-
-    def name(self) -> str:
-        """The name of a photograph."""
-        ...
-
-    def pass_over(self, size: int, *, after: int = 0) -> None:
-        """Leave out some bytes, and a list of records of so many."""
-        ...
-
-
-def _camera(source: _Source) -> tuple[int, ColmapCamera]:
+def _camera(source: "_Source") -> tuple[int, ColmapCamera]:
     (id,) = source.take("I")
     model, (width, height, *parameters) = source.lens()
     width, height = int(width), int(height)
@@ -262,7 +228,7 @@ def _camera(source: _Source) -> tuple[int, ColmapCamera]:
     )
 
 
-def _image(source: _Source) -> tuple[int, ColmapImage]:
+def _image(source: "_Source") -> tuple[int, ColmapImage]:
     id, *pose, camera = source.take(f"I{_POSE}I")
     name = source.name()
     source.pass_over(24)
@@ -270,13 +236,13 @@ def _image(source: _Source) -> tuple[int, ColmapImage]:
     return int(id), ColmapImage(name=name, camera_id=int(camera), cam_from_world=cam_from_world)
 
 
-def _point(source: _Source) -> tuple[float, ...]:
+def _point(source: "_Source") -> tuple[float, ...]:
     _, *found = source.take("QdddBBB")
     source.pass_over(8, after=8)
     return tuple(found)
 
 
-def _rig(source: _Source) -> tuple[int, dict[int, NDArray[np.float64]]]:
+def _rig(source: "_Source") -> tuple[int, dict[int, NDArray[np.float64]]]:
     id, sensors = source.take("II")
     poses: dict[int, NDArray[np.float64]] = {}
     for index in range(int(sensors)):
@@ -291,7 +257,7 @@ def _rig(source: _Source) -> tuple[int, dict[int, NDArray[np.float64]]]:
     return int(id), poses
 
 
-def _frame(source: _Source) -> ColmapFrame:
+def _frame(source: "_Source") -> ColmapFrame:
     _, rig, *pose, count = source.take(f"II{_POSE}I")
     images: list[tuple[int, int]] = []
     for _ in range(int(count)):
@@ -299,14 +265,13 @@ def _frame(source: _Source) -> ColmapFrame:
         sensor, image = source.take("IQ")
         if camera:
             images.append((int(sensor), int(image)))
-    rig_from_world = pose_of_quaternion(pose)
-    return ColmapFrame(rig_id=int(rig), rig_from_world=rig_from_world, images=tuple(images))
+    return int(rig), pose_of_quaternion(pose), tuple(images)
 
 
 class _Layout(NamedTuple):
     """What the records of a file are."""
 
-    parse: Callable[[_Source], Any]
+    parse: Callable[["_Source"], Any]
     columns: str
     min_bytes: int
     """What a record takes in a binary file at least."""
@@ -462,3 +427,7 @@ class _Cursor:
         more = len(self._data) - self._offset
         what = f"the end of the file at byte {self._offset}, got {more} bytes more: it is corrupt"
         expect(not more, self._path, what)
+
+
+_Source = _Line | _Cursor
+"""Fields of records, one after another."""

@@ -405,12 +405,9 @@ def _intrinsics(drive: Drive, camera: str) -> Intrinsics:
     projection = keyed_matrix(rows, f"P_rect_{number}", (3, 4), path=path)
     width, height = keyed_matrix(rows, f"S_rect_{number}", (1, 2), path=path)[0]
     return Intrinsics(
-        fx=float(projection[0, 0]),
-        fy=float(projection[1, 1]),
-        cx=float(projection[0, 2]) + _PIXEL_CENTRE,
-        cy=float(projection[1, 2]) + _PIXEL_CENTRE,
-        width=round(float(width)),
-        height=round(float(height)),
+        focal=(float(projection[0, 0]), float(projection[1, 1])),
+        centre=(float(projection[0, 2]) + _PIXEL_CENTRE, float(projection[1, 2]) + _PIXEL_CENTRE),
+        size=(round(float(width)), round(float(height))),
     )
 
 
@@ -427,13 +424,10 @@ def _fisheye(path: Path) -> Intrinsics:
     fx, fy, cx, cy, width, height, *distortion = values
     return Intrinsics(
         model="mei",
-        fx=fx,
-        fy=fy,
-        cx=cx + _PIXEL_CENTRE,
-        cy=cy + _PIXEL_CENTRE,
+        focal=(fx, fy),
+        centre=(cx + _PIXEL_CENTRE, cy + _PIXEL_CENTRE),
         distortion=tuple(distortion),
-        width=round(width),
-        height=round(height),
+        size=(round(width), round(height)),
     )
 
 

@@ -312,16 +312,15 @@ def intrinsics_of_frame(frame: Frame, *, where: str) -> Intrinsics | OfSize:
     model, distortion = lens_of(frame, where=where)
 
     def of_size(width: int, height: int) -> Intrinsics:
-        fx, fy = _focals(frame, (width, height), where=where)
         return Intrinsics(
             model=model,
-            fx=fx,
-            fy=fy,
-            cx=width / 2 if frame.cx is None else frame.cx,
-            cy=height / 2 if frame.cy is None else frame.cy,
+            focal=_focals(frame, (width, height), where=where),
+            centre=(
+                width / 2 if frame.cx is None else frame.cx,
+                height / 2 if frame.cy is None else frame.cy,
+            ),
             distortion=distortion,
-            width=width,
-            height=height,
+            size=(width, height),
         )
 
     if frame.w is None or frame.h is None:

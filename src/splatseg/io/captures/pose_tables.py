@@ -269,14 +269,13 @@ def _scannet_camera(path: Path, image: Path) -> Intrinsics:
                 f"{path}: expected the principal point near the middle of {image.name} of "
                 f"{width}x{height} pixels, got ({cx:g}, {cy:g}); was it exported at another size?"
             )
-    return _pinhole(fx, fy, cx, cy, (None, None))
+    return _pinhole(fx, fy, cx, cy, None)
 
 
 def _pinhole(
-    fx: float, fy: float, cx: float, cy: float, size: tuple[int | None, int | None]
+    fx: float, fy: float, cx: float, cy: float, size: tuple[int, int] | None
 ) -> Intrinsics:
-    fx, fy, cx, cy = float(fx), float(fy), float(cx), float(cy)
-    return Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=size[0], height=size[1])
+    return Intrinsics(focal=(float(fx), float(fy)), centre=(float(cx), float(cy)), size=size)
 
 
 IDR_FILES = ("cameras_sphere.npz", "cameras.npz")
@@ -330,7 +329,7 @@ def read_idr(folder: Path, *, strict: bool = False) -> Capture:
     raw: list[RawView] = []
     for image, (k, pose), (width, height) in zip(images, parts, sizes, strict=True):
         fx, fy, cx, cy = (float(k[at]) * scale for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
-        lens = Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
+        lens = _pinhole(fx, fy, cx, cy, (width, height))
         mask, name = masks.get(image.stem), image.name
         raw.append(
             RawView(image=image, relative=name, intrinsics=lens, cam_from_world=pose, mask=mask)
@@ -395,7 +394,7 @@ def _missing(folder: Path, index: int) -> RawView:
     return RawView(
         image=folder / _IMAGE_FOLDERS[0] / f"world_mat_{index}",
         relative=f"world_mat_{index}",
-        intrinsics=Intrinsics(fx=1, fy=1, cx=0.5, cy=0.5, width=1, height=1),
+        intrinsics=_pinhole(1, 1, 0.5, 0.5, (1, 1)),
         cam_from_world=np.eye(4),
     )
 

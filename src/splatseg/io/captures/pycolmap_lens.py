@@ -112,7 +112,6 @@ def _fitted(
     With (u, v) the equidistant coordinates, the pixel is linear in f, f k, f p, f s and the
     principal point, where ``ratio`` = fx / fy is known and pixels down are multiplied by it.
     """
-    width, height = size
     radius = np.linalg.norm(plane, axis=1)
     factor = np.where(radius > 1e-12, np.arctan(radius) / np.maximum(radius, 1e-12), 1.0)
     u, v = plane[:, 0] * factor, plane[:, 1] * factor
@@ -126,7 +125,7 @@ def _fitted(
     system = np.concatenate([of_x, of_y])
     target = np.concatenate([pixels[:, 0], pixels[:, 1] * ratio])
     if len(target) < system.shape[1]:
-        return Intrinsics(fx=1, fy=1, cx=0, cy=0, width=width, height=height), float("inf")
+        return Intrinsics(focal=(1, 1), centre=(0, 0), size=size), float("inf")
     # Columns of one length, so that high powers of small angles count.
     lengths = np.maximum(np.linalg.norm(system, axis=0), 1e-300)
     found = np.linalg.lstsq(system / lengths, target, rcond=1e-12)[0] / lengths
@@ -136,11 +135,8 @@ def _fitted(
     k1, k2, k3, k4, p1, p2, s1, s2 = (float(value) / focal for value in found[1:9])
     return Intrinsics(
         model="thin_prism_fisheye",
-        fx=focal,
-        fy=focal / ratio,
-        cx=float(found[9]),
-        cy=float(found[10]) / ratio,
+        focal=(focal, focal / ratio),
+        centre=(float(found[9]), float(found[10]) / ratio),
         distortion=(k1, k2, p1, p2, k3, k4, s1, s2),
-        width=width,
-        height=height,
+        size=size,
     ), error

@@ -25,19 +25,19 @@ _ROTATION_EXACT = 1e-9
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Intrinsics:
-    """What a layout says of a lens, in pixels of an image of `width` x `height`."""
+    """What a layout says of a lens, in pixels of an image of a size."""
 
     model: CameraModel = "pinhole"
-    fx: float
-    fy: float
-    cx: float
-    cy: float
+    focal: tuple[float, float]
+    """Across and down."""
+
+    centre: tuple[float, float]
+    """The principal point."""
+
     distortion: tuple[float, ...] = ()
 
-    width: int | None
-    """None where the layout does not say: the photograph's own size is meant."""
-
-    height: int | None
+    size: tuple[int, int] | None
+    """Width and height; None where the layout does not say: the photograph's own are meant."""
 
 
 OfSize: TypeAlias = Callable[[int, int], Intrinsics]
@@ -83,16 +83,14 @@ def scaled_to(intrinsics: Intrinsics, size: tuple[int, int], *, where: str) -> I
     Raises:
         InputError: If no uniform scale leads from one size to the other.
     """
-    width, height = intrinsics.width, intrinsics.height
-    if width is None or height is None:
-        return replace(intrinsics, width=size[0], height=size[1])
+    if intrinsics.size is None or intrinsics.size == size:
+        return replace(intrinsics, size=size)
+    width, height = intrinsics.size
     if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
         got = f"{quoted(width)}x{quoted(height)}"
         raise InputError(
             f"{where}: expected intrinsics of 1 to {MAX_SIDE} pixels a side, got {got}."
         )
-    if (width, height) == size:
-        return intrinsics
     if not same_shape(width, height, *size):
         turned = same_shape(height, width, *size)
         hint = "; turned by its EXIF orientation, perhaps" if turned else ""
@@ -101,8 +99,8 @@ def scaled_to(intrinsics: Intrinsics, size: tuple[int, int], *, where: str) -> I
             f"as its intrinsics say, got {size[0]}x{size[1]}{hint}."
         )
     sx, sy = size[0] / width, size[1] / height
-    fx, fy, cx, cy = intrinsics.fx * sx, intrinsics.fy * sy, intrinsics.cx * sx, intrinsics.cy * sy
-    return replace(intrinsics, width=size[0], height=size[1], fx=fx, fy=fy, cx=cx, cy=cy)
+    (fx, fy), (cx, cy) = intrinsics.focal, intrinsics.centre
+    return replace(intrinsics, size=size, focal=(fx * sx, fy * sy), centre=(cx * sx, cy * sy))
 
 
 def checked_pose(pose: NDArray[np.float64], *, where: str) -> NDArray[np.float64]:
@@ -185,10 +183,11 @@ def camera_of(
     Raises:
         InputError: If its pose or its lens is one that no camera has; `where` starts the message.
     """
-    for name, value in (("fx", intrinsics.fx), ("fy", intrinsics.fy)):
+    (fx, fy), (cx, cy) = intrinsics.focal, intrinsics.centre
+    for name, value in (("fx", fx), ("fy", fy)):
         if not (math.isfinite(value) and value > 0):
             raise InputError(f"{where}: expected a positive focal length, got {name} = {value:g}.")
-    rest = (intrinsics.cx, intrinsics.cy, *intrinsics.distortion)
+    rest = (cx, cy, *intrinsics.distortion)
     if not all(math.isfinite(value) for value in rest):
         raise InputError(f"{where}: expected finite intrinsics, got {rest}.")
     pose = checked_pose(view.cam_from_world, where=where)
@@ -197,10 +196,10 @@ def camera_of(
     return Camera(
         width=size[0],
         height=size[1],
-        fx=intrinsics.fx,
-        fy=intrinsics.fy,
-        cx=intrinsics.cx,
-        cy=intrinsics.cy,
+        fx=fx,
+        fy=fy,
+        cx=cx,
+        cy=cy,
         cam_from_world=torch.from_numpy(pose),
         model=intrinsics.model if distorted else "pinhole",
         distortion=intrinsics.distortion if distorted else (),

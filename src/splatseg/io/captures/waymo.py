@@ -23,13 +23,6 @@ from splatseg.errors import InputError, MissingFileError, SplatsegError
 from splatseg.io.atomic import atomic_folder, path_inside, sweep
 from splatseg.io.captures.build import build_capture
 from splatseg.io.captures.raw_views import Intrinsics, RawView, checked_pose, inverse_pose
-from splatseg.io.captures.waymo_tfrecord import (
-    ENDING,
-    LENS,
-    components_folder,
-    context_of,
-    unpack_components,
-)
 from splatseg.io.foreign import expect, is_file
 from splatseg.io.json_files import read_json, write_json
 from splatseg.io.parquet import Row, RowReader, bytes_of, integer_of, list_of, number_of, read_rows
@@ -40,6 +33,10 @@ LIDAR = "lidar"
 BOXES = "lidar_box"
 VEHICLE_POSES = "vehicle_pose"
 SUFFIX = ".parquet"
+OLD_SUFFIX = ".tfrecord"
+"""Of files of version 1 of the data set, which are refused."""
+
+LENS = ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3")
 CAMERA_POSE = "[CameraImageComponent].pose.transform"
 TIMESTAMP = "key.frame_timestamp_micros"
 MICROSECOND = 1e-6
@@ -169,11 +166,14 @@ class WaymoSegment:
 def find_segments(path: Path) -> tuple[WaymoSegment, ...]:
     """Segments below a folder of components, by name, or the one that a file is of.
 
-    Of a TFRecord file it is that of its components, which `one_segment` writes.
+    Raises:
+        InputError: If it is a TFRecord file, of version 1 of the data set.
     """
-    if path.suffix == ENDING and is_file(path):
-        root = components_folder(path)
-        return (WaymoSegment(root=root, context=context_of(path)),)
+    if path.suffix == OLD_SUFFIX:
+        raise InputError(
+            f"{path}: TFRecord files of version 1 of Waymo are not read; Waymo publishes the same "
+            "segments as Parquet files of version 2, which are."
+        )
     if path.suffix == SUFFIX:
         return (WaymoSegment(root=path.parent.parent, context=path.stem),) if is_file(path) else ()
     names = {
@@ -190,11 +190,8 @@ def one_segment(path: Path) -> WaymoSegment:
 
     Raises:
         MissingFileError: If there is none.
-        InputError: If there are several, or a TFRecord file is damaged.
-        OutputError: If the components of a TFRecord file cannot be written.
+        InputError: If there are several.
     """
-    if path.suffix == ENDING:
-        unpack_components(path)
     found = find_segments(path)
     what = f"segments of Waymo, {IMAGES}/CONTEXT{SUFFIX} and further components, got none"
     expect(found, path, what, error=MissingFileError)
@@ -248,8 +245,7 @@ def read_waymo(path: Path, *, strict: bool = False) -> Capture:
 
     Args:
         path: The folder of the components, if it has one segment, else the file of any component
-            of it, such as ``camera_image/CONTEXT.parquet``, or a TFRecord file of version 1, whose
-            components are written beside it (see `waymo_tfrecord`).
+            of it, such as ``camera_image/CONTEXT.parquet``.
         strict: As photographs are in the component, none can be listed that is not there.
 
     Raises:
@@ -299,7 +295,7 @@ def read_waymo(path: Path, *, strict: bool = False) -> Capture:
         up=(0.0, 0.0, 1.0),
         strict=strict,
     )
-    return replace(capture, path=path if path.suffix in (SUFFIX, ENDING) else segment.root)
+    return replace(capture, path=path if path.suffix == SUFFIX else segment.root)
 
 
 def photograph_name(time: int, camera: int) -> str:
@@ -371,13 +367,10 @@ def _calibrations(segment: WaymoSegment) -> dict[int, tuple[Intrinsics, NDArray[
         expect(sound, where, f"1 to {MAX_SIDE} pixels a side, got others")
         lens = Intrinsics(
             model="opencv",
-            fx=fx,
-            fy=fy,
-            cx=cx,
-            cy=cy,
+            focal=(fx, fy),
+            centre=(cx, cy),
             distortion=tuple(distortion),
-            width=width,
-            height=height,
+            size=(width, height),
         )
         found[camera] = lens, transform(row, extrinsic, where=where)
     return found

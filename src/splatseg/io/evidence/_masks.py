@@ -21,7 +21,7 @@ from splatseg.errors import reason
 from splatseg.io.arrays import npz_names, read_npy, read_npz
 from splatseg.io.evidence._base import EvidenceKind, FileEvidence
 from splatseg.io.evidence._labels import read_id_map
-from splatseg.io.foreign import expect, made_from, malformed
+from splatseg.io.foreign import derived_from, expect, malformed
 from splatseg.io.json_files import read_json_value
 from splatseg.io.limits import check_unpacked
 from splatseg.io.schema import Side, check_array, structured
@@ -52,7 +52,7 @@ class RunLengths:
         """
         what = f"run lengths of {width}x{height} pixels, with the size [{height}, {width}]"
         expect(self.size == (height, width), where, what, list(self.size))
-        with made_from(where):
+        with derived_from(where):
             if isinstance(self.counts, str):
                 return Rle.from_coco(self.counts, height=height, width=width)
             return Rle(height=height, width=width, counts=np.array(self.counts, np.uint32))
@@ -132,13 +132,8 @@ def _read_arrays(path: Path) -> MaskSet:
     whole = (levels == np.trunc(levels)) & (levels >= _INT32.min) & (levels <= _INT32.max)
     what = f"a whole number as level for each of {len(masks)} masks, from {_INT32.min} to "
     expect(whole.all(), path, f"{what}{_INT32.max}, got others")
-    return MaskSet(
-        height=int(masks.shape[1]),
-        width=int(masks.shape[2]),
-        masks=tuple(Rle.encode(torch.from_numpy(mask != 0)) for mask in masks),
-        scores=torch.from_numpy(scores.astype(np.float32)).clamp(0, 1),
-        levels=torch.from_numpy(levels.astype(np.int32)),
-    )
+    rles = [Rle.encode(torch.from_numpy(mask != 0)) for mask in masks]
+    return _mask_set(rles, scores.tolist(), levels.tolist(), masks.shape[1:])
 
 
 def _of_masks(

@@ -31,7 +31,7 @@ from splatseg.io.evidence._labels import LABEL_NAMES, IdRule, LabelEvidence, Pal
 from splatseg.io.evidence._masks import MaskEvidence, holds_mask_rows, holds_masks, mask_folders
 from splatseg.io.evidence._segments import SEGMENTS_FILE, TRACKS_FILE, open_tables
 from splatseg.io.foreign import expect
-from splatseg.io.json_files import read_json, read_json_value
+from splatseg.io.json_files import check_version, read_json, read_json_value
 from splatseg.io.label_tables import LabelTable, label_table, training_table
 from splatseg.io.schema import structured
 from splatseg.io.tables import class_table
@@ -253,10 +253,7 @@ def _header(folder: Path) -> dict[str, Any]:
     if not path.is_file():
         return {}
     header = read_json(path)
-    expect(header.get("format") == FORMAT, path, "evidence", header.get("format"))
-    version = structured(header.get("version"), int, where=f"{path}: version")
-    what = f"evidence of version {VERSION} or less, got version {version}"
-    expect(1 <= version <= VERSION, path, f"{what}; a later splatseg wrote it")
+    check_version(path, header, format=FORMAT, version=VERSION, what="evidence")
     return header
 
 

@@ -14,7 +14,7 @@ An object has ``timestamp``: the frame in which it was there, or -1 of what stan
 out here. Its box is ``vertices`` (8, of half a metre to each side) under ``transform`` (4 x 4, with
 the lengths of the box), in the world of the poses.
 
-Waymo has lidar_box, or laser_labels of frames of version 1. A box is upright in the axes of the
+Waymo has lidar_box. A box is upright in the axes of the
 vehicle in its frame; it has a place, lengths, a heading about z, and the velocity of the thing,
 m/s. Sun et al., CVPR 2020.
 """
@@ -39,14 +39,14 @@ from splatseg.io.captures.kitti360 import SCANS, VELODYNE, Drive, find_drive
 from splatseg.io.captures.waymo import (
     BOXES,
     MICROSECOND,
+    OLD_SUFFIX,
     SUFFIX,
     TIMESTAMP,
     VEHICLE_POSES,
     find_segments,
     one_segment,
 )
-from splatseg.io.captures.waymo_tfrecord import ENDING
-from splatseg.io.foreign import expect, is_file, is_folder, made_from, malformed
+from splatseg.io.foreign import derived_from, expect, is_file, is_folder, malformed
 from splatseg.io.json_files import read_json, write_json
 from splatseg.io.moving.views import CLOCKS, Clock
 from splatseg.io.parquet import Row, integer_of, number_of, read_rows
@@ -58,8 +58,6 @@ FOLDER = "data_3d_bboxes"
 _SPLITS = ("train_full", "train")
 _SUFFIX = ".xml"
 _STANDS = -1
-_MATRICES = (f"{m}.{part}" for m in ("transform", "vertices") for part in ("rows", "cols", "data"))
-_WANTED = frozenset(("label", "instanceId", "timestamp", *_MATRICES))
 _LONGEST_NAME = 80
 
 _COMPONENT = "[LiDARBoxComponent]"
@@ -97,7 +95,7 @@ def read_moving(path: Path, *, clock: Clock = "recorded") -> tuple[MovingBox, ..
         MissingPackageError: If it is of Waymo, and pyarrow is not installed.
     """
     check_choice("clock", clock, CLOCKS)
-    if path.suffix in (SUFFIX, ENDING) or (
+    if path.suffix in (SUFFIX, OLD_SUFFIX) or (
         path.is_dir() and any(segment.has(BOXES) for segment in find_segments(path))
     ):
         return _read_waymo(path, clock)
@@ -136,7 +134,7 @@ def _read_json(path: Path) -> tuple[MovingBox, ...]:
         expect(not twice, where, "a time, or a start and an end, got both")
         start = box.time if box.start is None else box.start
         end = box.time if box.end is None else box.end
-        with made_from(where):
+        with derived_from(where):
             found.append(
                 MovingBox(
                     centre=torch.tensor(box.centre, dtype=torch.float64),
@@ -176,7 +174,7 @@ def _read_kitti360(path: Path, clock: Clock) -> tuple[MovingBox, ...]:
     recorded = clock == "recorded"
     times = read_times(drive.of(SCANS, VELODYNE, "timestamps.txt")) if recorded else None
     found: list[MovingBox] = []
-    for stored in stored_objects(file, _WANTED):
+    for stored in stored_objects(file):
         if not stored.has("transform"):
             continue
         frame = stored.whole("timestamp")
@@ -215,7 +213,7 @@ def _kitti360_box(stored: StoredObject, frame: int, times: NDArray[np.float64] |
     low, high = along.min(axis=0), along.max(axis=0)
     start, end = _span(times, frame)
     name = f"{stored.text('label') or 'thing'} {stored.text('instanceId')}"
-    with made_from(stored.where):
+    with derived_from(stored.where):
         return MovingBox(
             centre=torch.from_numpy(transform[:3, 3] + axes @ ((low + high) / 2)),
             size=(float(high[0] - low[0]), float(high[1] - low[1]), float(high[2] - low[2])),
@@ -289,7 +287,7 @@ def _waymo_box(
     x, y, z, heading = values[3:]
     cos, sin = math.cos(heading), math.sin(heading)
     turned = pose[:3, :3] @ np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1.0]])
-    with made_from(where):
+    with derived_from(where):
         return MovingBox(
             centre=torch.from_numpy(pose[:3, :3] @ np.array(values[:3]) + pose[:3, 3]),
             size=(x, y, z),

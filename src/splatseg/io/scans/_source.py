@@ -22,7 +22,7 @@ from splatseg.core import UNLABELLED, ClassTable
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.scans import Scan
 from splatseg.errors import InputError
-from splatseg.io.foreign import expect, made_from, malformed, read_bytes
+from splatseg.io.foreign import derived_from, expect, malformed, read_bytes
 
 MAX_ID = 2**31 - 2
 PIECE = 1_000_000
@@ -148,7 +148,7 @@ def build_scan(name: str, raw: RawScan, classes: ClassTable | None) -> Scan:
     points = points[kept]
     if pose is not None:
         points = points @ pose[:3, :3].T + pose[:3, 3]
-    with made_from(raw.where):
+    with derived_from(raw.where):
         return Scan(
             name=name,
             points=torch.from_numpy(np.ascontiguousarray(points)),

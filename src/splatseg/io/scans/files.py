@@ -1,11 +1,11 @@
 """Points in files of their own that are in the world already: PLY, NumPy, LAS; and range images.
 
-A file of many points is read in pieces. PLY of binary rows is read from the disk piece by piece;
-ASCII and compressed archives are read at once. Labels are the column ``semantic``, ``class_id``,
-``label``, ``class`` or ``classification``, and ``instance`` or ``instance_id``; 0 is void. Other
-spellings are found as CloudCompare exports them, ``scalar_`` before the name. Arrays are ``xyz`` or
-``points`` (n x 3), ids ``semantic`` and ``instance``; an ``.npy`` is n x 3 or more, of which the
-first three columns count.
+A file of many points is read in pieces. PLY of binary rows is mapped, and read from the disk piece
+by piece; ASCII and compressed archives are read at once. Labels are the column ``semantic``,
+``class_id``, ``label``, ``class`` or ``classification``, and ``instance`` or ``instance_id``; 0 is
+void. Other spellings are found as CloudCompare exports them, ``scalar_`` before the name. Arrays
+are ``xyz`` or ``points`` (n x 3), ids ``semantic`` and ``instance``; an ``.npy`` is n x 3 or more,
+of which the first three columns count.
 
 LAS and LAZ need laspy, and lazrs for LAZ. ASPRS, LAS Specification 1.4 R15: classification 0 is
 "created, never classified", 1 is "unclassified"; both are void. A dimension ``class_id`` (as
@@ -26,7 +26,7 @@ from splatseg.io.arrays import npz_names, read_npy, read_npz
 from splatseg.io.captures import read_metadata
 from splatseg.io.captures.raw_views import checked_pose
 from splatseg.io.foreign import expect, malformed, reading
-from splatseg.io.ply import PlyHeader, read_ply_header, read_ply_tables
+from splatseg.io.ply import read_ply_vertices
 from splatseg.io.scans._las_sizes import check_las_sizes
 from splatseg.io.scans._source import Piece, RawScan, Scans, read_in_pieces, refuse_twice
 from splatseg.io.schema import check_array
@@ -110,33 +110,10 @@ def ply_pieces(path: Path) -> tuple[int, Callable[[int, int], Mapping[str, NDArr
         FileFormatError: If it is no PLY whose first element is vertex with x, y and z, or it
             ends early.
     """
-    header = read_ply_header(path)
-    element = header.elements[0] if header.elements else None
-    names = [] if element is None else [one.name for one in element.properties]
-    if element is None or element.name != "vertex" or not {"x", "y", "z"} <= set(names):
-        what = "a PLY whose first element is vertex with x, y and z"
-        raise malformed(path, what, ", ".join(names) or None)
-    lists = any(one.count_code is not None for one in element.properties)
-    if not header.order or lists:
-        columns = read_ply_tables(path, header, ["vertex"])["vertex"].numbers
-        return element.count, lambda start, end: {
-            name: values[start:end] for name, values in columns.items()
-        }
-    dtype = np.dtype([(one.name, header.order + one.code) for one in element.properties])
-    with reading(path, "a PLY file"):
-        have = path.stat().st_size - header.offset
-    what = f"{element.count} points of {dtype.itemsize} bytes, got {have} bytes"
-    expect(have >= dtype.itemsize * element.count, path, f"{what}: the file ends early")
-    return element.count, partial(_ply_rows, path, header, dtype)
-
-
-def _ply_rows(
-    path: Path, header: PlyHeader, dtype: np.dtype[np.void], start: int, end: int
-) -> Mapping[str, NDArray[Any]]:
-    with reading(path, "a PLY file"):
-        rows = np.fromfile(path, dtype, end - start, offset=header.offset + start * dtype.itemsize)
-    expect(len(rows) == end - start, path, f"{end} points, but the file ends early")
-    return {name: rows[name] for name in dtype.names or ()}
+    columns = read_ply_vertices(path)
+    return len(columns["x"]), lambda start, end: {
+        name: values[start:end] for name, values in columns.items()
+    }
 
 
 def positions(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.float64]:
@@ -203,7 +180,7 @@ def _open_las(path: Path) -> Generator[Any]:
     check_las_sizes(path)
     with reading(path, _LAS), path.open("rb") as file:
         try:
-            with laspy.open(file, closefd=False) as reader:
+            with laspy.open(file, closefd=False, read_evlrs=False) as reader:
                 yield reader
         except laspy.LaspyException as error:
             raise malformed(path, f"{_LAS}, but it cannot be read ({error!s:.100})") from error

@@ -30,7 +30,6 @@ from splatseg.io.captures.waymo import (
     one_segment,
     transform,
 )
-from splatseg.io.captures.waymo_tfrecord import ENDING
 from splatseg.io.foreign import expect, malformed
 from splatseg.io.parquet import Row, RowReader, integer_of, list_of, number_of, read_rows
 from splatseg.io.scans._source import RawScan, Scans, refuse_twice
@@ -68,8 +67,6 @@ class Laser(NamedTuple):
 
 def find_waymo_scans(path: Path) -> bool:
     """Whether a folder has segments with range images, or a file is of one."""
-    if path.suffix == ENDING:
-        return bool(find_segments(path))
     return any(segment.has(LIDAR) and segment.has(CALIBRATIONS) for segment in find_segments(path))
 
 
@@ -84,7 +81,7 @@ def read_waymo_scans(path: Path) -> Scans:
 
     Args:
         path: The folder of the components, if it has one segment, else the file of any component
-            of it, or a TFRecord file of version 1.
+            of it.
 
     Raises:
         MissingFileError: If lidar, lidar_calibration or vehicle_pose is missing.

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from os import PathLike
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -26,6 +26,7 @@ from splatseg.core.sh import MAX_DEGREE
 from splatseg.errors import FileFormatError, MissingFileError, quoted
 from splatseg.io.foreign import expect, is_file, is_folder, read_bytes
 from splatseg.io.limits import check_unpacked
+from splatseg.io.text_numbers import numbers_of
 
 StrPath: TypeAlias = str | PathLike[str]
 Array: TypeAlias = NDArray[np.float32]
@@ -97,6 +98,21 @@ def read_file(path: Path) -> bytes:
     """All bytes of a file that must exist, be a file and not be empty."""
     check_file(path)
     return read_bytes(path, "a splat file")
+
+
+def beside(path: Path, name: str) -> Path:
+    """A file that another one names, in its folder or below.
+
+    Raises:
+        FileFormatError: If the name leads elsewhere.
+        MissingFileError: If there is no such file.
+    """
+    relative = Path(name)
+    leaves = ":" in name or "\\" in name or relative.is_absolute() or ".." in relative.parts
+    expect(not leaves, path, f"the name of a file in its folder, got {quoted(name)}")
+    what = f"a file {quoted(name)}, which {path.name} names, got none"
+    expect(is_file(path.parent / relative), path.parent, what, error=MissingFileError)
+    return path.parent / relative
 
 
 def check_file(path: Path) -> int:
@@ -178,44 +194,30 @@ _ANTIALIASED = {
 _VARIANCE_LINE = "splatseg low_pass "
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Filter:
-    """How Gaussians want to be drawn, as comments of a PLY file say it."""
+def drawn_as(path: Path, comments: Sequence[str]) -> dict[str, Any]:
+    """How Gaussians want to be drawn, `low_pass` and `antialiased`, as comments of a PLY file say.
 
-    antialiased: bool = False
-    low_pass: float = LOW_PASS
-
-    @classmethod
-    def of(cls, gaussians: Gaussians) -> "Filter":
-        """What Gaussians are meant for."""
-        return cls(antialiased=gaussians.antialiased, low_pass=gaussians.low_pass)
-
-    @classmethod
-    def from_comments(cls, path: Path, comments: Sequence[str]) -> "Filter":
-        """Read the lines that `comments` writes; without one, what 3DGS draws with."""
-        low_pass, antialiased = LOW_PASS, False
-        for line in comments:
-            if line.startswith(_VARIANCE_LINE):
-                low_pass = _variance(path, line.removeprefix(_VARIANCE_LINE))
-            antialiased = _ANTIALIASED.get(" ".join(line.lower().split()), antialiased)
-        return cls(antialiased=antialiased, low_pass=low_pass)
-
-    def comments(self) -> list[str]:
-        """Lines for the header; none for what 3DGS draws with."""
-        lines = [ANTIALIASED] if self.antialiased else []
-        if self.low_pass != LOW_PASS:
-            lines.append(f"{_VARIANCE_LINE}{self.low_pass!r}")
-        return lines
+    Raises:
+        FileFormatError: If a line of ours has no number.
+    """
+    low_pass, antialiased = LOW_PASS, False
+    for line in comments:
+        if line.startswith(_VARIANCE_LINE):
+            text = line.removeprefix(_VARIANCE_LINE)
+            found = numbers_of([text])
+            low_pass = math.nan if found is None else float(found[0])
+            sound = 0 <= low_pass < math.inf
+            expect(sound, path, f"'low_pass' to be 0 or more, got {quoted(text)}")
+        antialiased = _ANTIALIASED.get(" ".join(line.lower().split()), antialiased)
+    return {"low_pass": low_pass, "antialiased": antialiased}
 
 
-def _variance(path: Path, text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    fits = math.isfinite(value) and value >= 0
-    expect(fits, path, f"'low_pass' to be 0 or more, got {quoted(text)}")
-    return value
+def drawing_comments(gaussians: Gaussians) -> list[str]:
+    """Lines that `drawn_as` reads; none for what 3DGS draws with."""
+    lines = [ANTIALIASED] if gaussians.antialiased else []
+    if gaussians.low_pass != LOW_PASS:
+        lines.append(f"{_VARIANCE_LINE}{gaussians.low_pass!r}")
+    return lines
 
 
 _VALUES = "hold values that are NaN or infinite"
@@ -232,7 +234,8 @@ def finish(
     extra: Mapping[str, Tensor] | None = None,
     *,
     strict: bool,
-    drawn: Filter = Filter(),
+    antialiased: bool = False,
+    low_pass: float = LOW_PASS,
 ) -> Gaussians:
     """Check every row, give quaternions unit length and make `Gaussians` without a copy.
 
@@ -279,8 +282,8 @@ def finish(
         opacities=torch.from_numpy(rows.opacities),
         sh=torch.from_numpy(rows.sh),
         extra=kept,
-        antialiased=drawn.antialiased,
-        low_pass=drawn.low_pass,
+        antialiased=antialiased,
+        low_pass=low_pass,
     )
 
 

@@ -8,7 +8,9 @@ opacity as bytes. Element ``sh``, where there are harmonics, has a byte for each
 column, which spans [-4, 4]. See docs/formats/splats.md.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,14 +19,15 @@ from splatseg.core import Gaussians
 from splatseg.core.sh import MAX_DEGREE, SH_C0
 from splatseg.errors import FileFormatError, quoted
 from splatseg.io.foreign import expect
-from splatseg.io.ply import PlyElement, PlyHeader, ply_header, ply_offsets, read_ply_header
+from splatseg.io.ply import PlyElement, PlyHeader, ply_header, read_ply_header, read_ply_tables
 from splatseg.io.splats._quantisation import pack_smallest_three, unpack_smallest_three
 from splatseg.io.splats._rows import (
     Array,
-    Filter,
     Losses,
     Rows,
     blocks,
+    drawing_comments,
+    drawn_as,
     finish,
     logs,
     to_rows,
@@ -64,22 +67,15 @@ def read_compressed_ply(path: Path, *, strict: bool = False) -> Gaussians:
         MissingFileError: If there is no such file.
     """
     header = read_ply_header(path)
-    offsets = ply_offsets(path, header)
     vertex, chunk, sh = _elements(path, header)
     names = sh.names if sh else ()
     rows = Rows.empty(vertex.count, 1 + len(names) // 3)
-    bounds = np.fromfile(path, chunk.dtype(header.order), chunk.count, offset=offsets["chunk"])
-    packed = np.memmap(path, np.uint8, "r") if vertex.count else np.empty(0, np.uint8)
-
-    def rows_of(element: PlyElement, part: slice) -> np.ndarray:
-        """Some rows of an element of the mapped file."""
-        dtype = element.dtype(header.order)
-        first, last = (offsets[element.name] + i * dtype.itemsize for i in (part.start, part.stop))
-        return packed[first:last].view(dtype)
-
+    tables = read_ply_tables(path, header, ("chunk", "vertex", "sh"), whole=True)
+    packed = tables["vertex"].numbers
     for part in blocks(vertex.count, 64 * CHUNK):
-        block = rows_of(vertex, part)
-        of_row = bounds[np.arange(part.start, part.stop) // CHUNK]
+        block = {name: packed[name][part] for name in _PACKED}
+        chunks = np.arange(part.start, part.stop) // CHUNK
+        of_row = {name: ends[chunks] for name, ends in tables["chunk"].numbers.items()}
         position = _fractions(block["packed_position"])
         rows.means[part] = _between(position, of_row, ("x", "y", "z"))
         scale = _fractions(block["packed_scale"])
@@ -92,11 +88,12 @@ def read_compressed_ply(path: Path, *, strict: bool = False) -> Gaussians:
         rows.sh[part, 0] = (rgb - 0.5) / SH_C0
         rows.opacities[part] = colour[:, 3]
         if sh is not None:
-            table = rows_of(sh, part).view(np.uint8).reshape(-1, 3, len(names) // 3)
-            rows.sh[part, 1:] = _HARMONIC[table].transpose(0, 2, 1)
+            steps = np.stack([tables["sh"].numbers[name][part] for name in names], axis=1)
+            steps = steps.reshape(-1, 3, len(names) // 3)
+            rows.sh[part, 1:] = _HARMONIC[steps].transpose(0, 2, 1)
     with np.errstate(over="ignore"):
         np.exp(rows.scales, out=rows.scales)
-    return finish(path, rows, strict=strict, drawn=Filter.from_comments(path, header.comments))
+    return finish(path, rows, strict=strict, **drawn_as(path, header.comments))
 
 
 def _harmonic_of_byte() -> Array:
@@ -154,7 +151,7 @@ def _fractions(packed: NDArray[np.uint32]) -> NDArray[np.float64]:
 
 
 def _between(
-    share: NDArray[np.float64], bounds: np.ndarray, names: tuple[str, ...]
+    share: NDArray[np.float64], bounds: Mapping[str, NDArray[Any]], names: tuple[str, ...]
 ) -> NDArray[np.float64]:
     """Numbers between the bounds of their chunk."""
     low = np.stack([bounds[f"min_{name}"] for name in names], axis=1)
@@ -199,7 +196,7 @@ def write_compressed_ply(gaussians: Gaussians, path: Path, *, losses: Losses) ->
         ]
         rest = [(f"f_rest_{i}", "|u1") for i in range(3 * (rows.sh.shape[1] - 1))]
         tables += [("sh", count, rest)] if rest else []
-        file.write(ply_header(tables, Filter.of(gaussians).comments()))
+        file.write(ply_header(tables, drawing_comments(gaussians)))
         file.write(bounds.tobytes())
         file.write(packed.tobytes())
         if rows.sh.shape[1] > 1:

@@ -24,11 +24,20 @@ from numpy.typing import NDArray
 from splatseg.core import Gaussians, Similarity
 from splatseg.core.rigid import rotation_from_quaternion
 from splatseg.core.sh import MAX_DEGREE, SH_C0
-from splatseg.errors import FileFormatError, MissingFileError, quoted
-from splatseg.io.foreign import expect, is_file, malformed, read_bytes
+from splatseg.errors import FileFormatError, quoted
+from splatseg.io.foreign import expect, malformed, read_bytes
 from splatseg.io.json_files import parse_object
 from splatseg.io.schema import structured
-from splatseg.io.splats._rows import SOURCE_ROW, Array, Rows, check_size, finish, read_file, warn
+from splatseg.io.splats._rows import (
+    SOURCE_ROW,
+    Array,
+    Rows,
+    beside,
+    check_size,
+    finish,
+    read_file,
+    warn,
+)
 
 EXTENSION = "KHR_gaussian_splatting"
 _UNDERSTOOD = (EXTENSION, "KHR_mesh_quantization", "KHR_materials_unlit")
@@ -417,7 +426,7 @@ class _Gltf:
     def _load(self, uri: str) -> bytes:
         """What a URI stands for; only data URIs and files in the same folder or below."""
         if not uri.startswith("data:"):
-            return read_bytes(self._beside(uri), "a buffer of glTF")
+            return read_bytes(beside(self.path, unquote(uri)), "a buffer of glTF")
         head, _, body = uri.partition(",")
         try:
             if head.endswith(";base64"):
@@ -426,23 +435,10 @@ class _Gltf:
             pass
         raise FileFormatError(f"{self.path}: expected a data URI in base64, got {quoted(uri)}.")
 
-    def _beside(self, uri: str) -> Path:
-        """The file that a URI names."""
-        name = unquote(uri)
-        relative = Path(name)
-        leaves = ":" in name or "\\" in name or relative.is_absolute() or ".." in relative.parts
-        expect(not leaves, self.path, f"a file in the folder of this one, got {quoted(uri)}")
-        target = self.path.parent / relative
-        if not is_file(target):
-            raise MissingFileError(
-                f"{self.path.parent}: no such file as {quoted(name)}, which {self.path.name} names."
-            )
-        return target
-
     def packed_size(self) -> int:
         """Bytes of the file and of the buffers that lie beside it."""
         uris = [one.uri for one in self.root.buffers if one.uri is not None]
-        files = {self._beside(uri) for uri in uris if not uri.startswith("data:")}
+        files = {beside(self.path, unquote(uri)) for uri in uris if not uri.startswith("data:")}
         return self._size + sum(file.stat().st_size for file in files)
 
     def meshes(self) -> Iterator[tuple[_Mesh, NDArray[np.float64]]]:

@@ -22,13 +22,14 @@ from splatseg.core import Gaussians
 from splatseg.core.sh import MAX_DEGREE, SH_C0
 from splatseg.errors import FileFormatError, InputError, brief, quoted
 from splatseg.io.foreign import expect
-from splatseg.io.ply import PlyElement, PlyHeader, ply_header, ply_offsets, read_ply_rows
+from splatseg.io.ply import PlyElement, PlyHeader, ply_header, read_ply_tables
 from splatseg.io.splats._rows import (
     BLOCK,
-    Filter,
     Losses,
     Rows,
     blocks,
+    drawing_comments,
+    drawn_as,
     finish,
     logits,
     logs,
@@ -184,10 +185,10 @@ def read_ply(
         linear: Which of scales and opacities the file has as they are, not as logs and logits.
         own: Whether splatseg wrote it: nothing in it is doubted, and no column is a filter.
     """
-    offsets = ply_offsets(path, header)
     vertex, columns = _find_columns(path, header, own=own)
     rendered_degree(path, MAX_DEGREE + 1 if columns.beyond else 0, strict=strict)
     kinds = vertex.dtype()
+    table = read_ply_tables(path, header, ["vertex"], whole=True)["vertex"].numbers
     rows = Rows.empty(vertex.count, 1 + len(columns.rest) // 3)
     filters = np.zeros(vertex.count, np.float32)
     extra = {
@@ -195,12 +196,14 @@ def read_ply(
         for name in vertex.names
         if name not in columns.used
     }
-    for part, block in read_ply_rows(path, header, "vertex", offsets, block=BLOCK // 4):
-        _unpack(block, rows, part, columns)
-        if columns.filter_3d is not None:
-            filters[part] = block[columns.filter_3d]
-        for name, column in extra.items():
-            column[part] = block[name]
+    for part in blocks(vertex.count, BLOCK // 4):
+        block = {name: values[part] for name, values in table.items()}
+        with np.errstate(over="ignore"):  # text may have numbers beyond float32
+            _unpack(block, rows, part, columns)
+            if columns.filter_3d is not None:
+                filters[part] = block[columns.filter_3d]
+            for name, column in extra.items():
+                column[part] = block[name]
     too_large = columns.coloured and bool((rows.sh[:, 0] > 0.5 / SH_C0 + 1e-3).any())
     what = f"real colours {' '.join(columns.dc)} in [0, 1], got larger ones"
     expect(not too_large, path, what)
@@ -213,8 +216,8 @@ def read_ply(
         _smooth(rows, filters, axes=len(columns.scales))
     if len(columns.scales) == 2:
         rows.scales[:, 2] = _FLAT * rows.scales[:, :2].min(axis=1)
-    drawn = Filter.from_comments(path, header.comments)
-    return finish(path, rows, _restore(header, extra), strict=strict, drawn=drawn)
+    drawn = drawn_as(path, header.comments)
+    return finish(path, rows, _restore(header, extra), strict=strict, **drawn)
 
 
 def _find_columns(path: Path, header: PlyHeader, *, own: bool) -> tuple[PlyElement, _Columns]:
@@ -303,7 +306,7 @@ def _nothing(path: Path, header: PlyHeader, lacking: Sequence[str], *, coloured:
     return f"expected Gaussians, got a PLY file without {wanted} ({have})."
 
 
-def _unpack(block: np.ndarray, rows: Rows, part: slice, columns: _Columns) -> None:
+def _unpack(block: Mapping[str, np.ndarray], rows: Rows, part: slice, columns: _Columns) -> None:
     """Copy the columns of Gaussians of some rows to where they belong."""
     for target, names in (
         (rows.means, columns.means),
@@ -423,7 +426,7 @@ def write_ply(gaussians: Gaussians, path: Path, *, losses: Losses) -> None:
     _check_names(extra, standard)
     fields = [(name, "<f4") for name in standard]
     fields += [(name, column.dtype.str) for name, column in extra.items() if name not in standard]
-    comments = [*Filter.of(gaussians).comments(), *notes]
+    comments = [*drawing_comments(gaussians), *notes]
     with path.open("wb") as file:
         file.write(ply_header([("vertex", len(gaussians), fields)], comments))
         for part in blocks(len(gaussians), BLOCK // 4):

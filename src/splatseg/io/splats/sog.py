@@ -26,17 +26,17 @@ from PIL import Image
 from splatseg.core import Gaussians
 from splatseg.core.gaussians import sigmoid
 from splatseg.core.sh import MAX_DEGREE
-from splatseg.errors import FileFormatError, InputError, MissingFileError, quoted
+from splatseg.errors import FileFormatError, InputError, quoted
 from splatseg.io.arrays import open_archive, open_member
-from splatseg.io.foreign import expect, is_file, malformed, read_bytes, reading
+from splatseg.io.foreign import expect, malformed, read_bytes, reading
 from splatseg.io.json_files import parse_object
 from splatseg.io.schema import structured
 from splatseg.io.splats._quantisation import assemble, scalar_codebook, split, vector_palette
 from splatseg.io.splats._rows import (
     Array,
-    Filter,
     Losses,
     Rows,
+    beside,
     blocks,
     check_file,
     check_size,
@@ -124,8 +124,8 @@ def read_sog(path: Path, *, strict: bool = False) -> Gaussians:
     with path.open("rb") as file:
         bundled = file.read(2) == b"PK"
     if not bundled:
-        beside = [file for file in path.parent.glob("*.webp") if file.is_file()]
-        packed = sum(file.stat().st_size for file in (path, *beside))
+        pictures = [file for file in path.parent.glob("*.webp") if file.is_file()]
+        packed = sum(file.stat().st_size for file in (path, *pictures))
         load = partial(_load_beside, path)
         return _Bundle(path, load, path.name, packed).gaussians(strict=strict)
     with open_archive(path, where=path, expected="a zip file of SOG") as archive:
@@ -138,14 +138,8 @@ def read_sog(path: Path, *, strict: bool = False) -> Gaussians:
 
 
 def _load_beside(path: Path, name: str, limit: int) -> bytes:
-    """A file in the folder of `path`; a name that points elsewhere is refused."""
-    here = Path(name).name == name
-    expect(here, path, f"the name of a file beside it, got {quoted(name)}")
-    member = path.parent / name
-    if not is_file(member):
-        raise MissingFileError(
-            f"{path.parent}: no such file as {quoted(name)}, which {path.name} names."
-        )
+    """A file in the folder of `path`."""
+    member = beside(path, name)
     expect(member.stat().st_size <= limit, member, f"at most {limit} bytes, got more")
     return read_bytes(member, "a picture of SOG")
 
@@ -192,7 +186,7 @@ class _Bundle:
         with np.errstate(over="ignore"):
             np.exp(rows.scales, out=rows.scales)
         antialiased = meta.antialias is True or meta.model == "antialiased"
-        return finish(path, rows, strict=strict, drawn=Filter(antialiased=antialiased))
+        return finish(path, rows, strict=strict, antialiased=antialiased)
 
     def _pixels_of(self, name: str) -> Pixels:
         """The pixels (n, 4) of a picture that has about as many of them as Gaussians."""

@@ -24,7 +24,6 @@ from splatseg.io.foreign import expect, malformed
 from splatseg.io.splats._quantisation import pack_signed_three, unpack_signed_three
 from splatseg.io.splats._rows import (
     Array,
-    Filter,
     Losses,
     Rows,
     blocks,
@@ -108,8 +107,8 @@ def read_spz(path: Path, *, strict: bool = False) -> Gaussians:
             signs = _FLIP_SH[: coefficients - 1, None]
             kept = rest[part, : coefficients - 1].astype(np.float32)
             rows.sh[part, 1:] = (kept - 128) / 128 * signs
-    drawn = Filter(antialiased=bool(header.flags & _ANTIALIASED))
-    return finish(path, rows, strict=strict, drawn=drawn)
+    antialiased = bool(header.flags & _ANTIALIASED)
+    return finish(path, rows, strict=strict, antialiased=antialiased)
 
 
 def _header(path: Path, data: bytes) -> _Header:

@@ -4,7 +4,6 @@ The file is an npz (a ZIP archive of NumPy arrays, uncompressed, nothing pickled
 JSON. It is written under a second name and takes the place of the one before when it is complete.
 """
 
-import time
 from collections.abc import Collection, Generator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -24,20 +23,17 @@ from splatseg.core.checkpoints import (
     CheckpointSchedule,
     differing_names,
     option_differences,
-    without_checkpoint,
 )
 from splatseg.core.json_values import json_integer
 from splatseg.errors import (
     FileFormatError,
     InputError,
-    OutputError,
     RangeError,
     ShapeError,
     brief,
-    quoted,
 )
-from splatseg.io.arrays import open_npz, write_checkpoint_file
-from splatseg.io.json_files import parse_object
+from splatseg.io.arrays import write_checkpoint_file
+from splatseg.io.checkpoint_files import read_checkpoint_file
 from splatseg.io.schema import structured
 
 
@@ -169,12 +165,9 @@ class RowAdam:
         )
 
 
-FORMAT = "splatseg-training"
 VERSION = 1
 """Version of the files written. No other is read: a training is resumed by the program it began
 in."""
-
-_HEADER = "header"
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -254,7 +247,7 @@ def write_state(state: TrainingState, path: Path, identity: Mapping[str, Any]) -
         OutputError: If it cannot be written; the one before is still there.
     """
     header = {
-        "format": FORMAT,
+        "format": "splatseg-training",
         "version": VERSION,
         "identity": dict(identity),
         "step": state.step,
@@ -339,18 +332,7 @@ class _Header:
 def _read(
     path: Path, names: Collection[str] | None = None
 ) -> tuple[_Header, dict[str, NDArray[Any]]]:
-    """The header and the arrays of these names; None reads all of them."""
-    with open_npz(path, expected="the checkpoint of a training") as file:
-        header = parse_object(file.array(_HEADER).tobytes(), where=str(path))
-        wanted = [name for name in file.names if names is None or name in names]
-        arrays = {name: file.array(name) for name in wanted if name != _HEADER}
-    if header.get("format") != FORMAT:
-        raise FileFormatError(f"{path}: expected the checkpoint of a training, got another file.")
-    if header.get("version") != VERSION:
-        raise FileFormatError(
-            f"{path}: expected a checkpoint of version {VERSION}, got version "
-            f"{quoted(header.get('version'))}; another splatseg wrote it."
-        )
+    header, arrays = read_checkpoint_file(path, "training", VERSION, names)
     return structured(header, _Header, where=str(path)), arrays
 
 
@@ -430,13 +412,12 @@ class TrainingFile:
         """Write a checkpoint, unless the file has this step already, or tell that it cannot be."""
         if self._written == state.step:
             return
-        begin = time.monotonic()
-        try:
+
+        def save() -> None:
             write_state(state, self._checkpoints.path, self._identity)
             self._written = state.step
-        except OutputError as error:
-            self._checkpoints.failed(without_checkpoint(error))
-        self._schedule.written(time.monotonic() - begin)
+
+        self._schedule.write(save)
 
     @contextmanager
     def written_on_error(self, state: TrainingState) -> Generator[None]:

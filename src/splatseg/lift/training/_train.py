@@ -12,7 +12,6 @@ from torch import Tensor
 
 from splatseg.core.boundary import boundary
 from splatseg.core.checkpoints import Checkpoints, Interrupts, deferred_interrupts
-from splatseg.core.threads import one_torch_thread
 from splatseg.lift.training._options import SamplingOptions, TrainingOptions, rate_factor
 from splatseg.lift.training._sampler import Batch, DrawnRows, RowSampler, held_out_views
 from splatseg.lift.training._state import AdamConstants, RowAdam, TrainingFile, TrainingState
@@ -325,8 +324,7 @@ class _Run:
             self._score()
         batches = self._next_batches()
         state.step += 1
-        with one_torch_thread():
-            self._step(batches)
+        self._step(batches)
         last = state.step == options.steps
         due = state.step % options.score_every == 0 or last
         if self._held_out is not None and due:
@@ -356,10 +354,7 @@ class _Run:
         return np.random.default_rng((self._seed, kind, *numbers))
 
     def _draw(self, number: int) -> DrawnRows:
-        # Many small sums: sharing each among threads costs more than it saves, and where the
-        # machine is busy many times more. Rows are found by the library's own threads.
-        with one_torch_thread():
-            return self._sampler.draw(self._rng(_DRAW, number), batch=self._options.batch)
+        return self._sampler.draw(self._rng(_DRAW, number), batch=self._options.batch)
 
     def _next_batches(self) -> Iterator[Batch]:
         """The batches of the next step, each cut when it is asked for."""
@@ -438,7 +433,7 @@ class _Run:
             step=state.step,
             differentiable=False,
         )
-        with torch.no_grad(), one_torch_thread():
+        with torch.no_grad():
             score = self._model.score(self._scored, values)
         state.scores.append((state.step, float(score)))
         if self._options.patience > 0 and self._best_index == len(state.scores) - 1:

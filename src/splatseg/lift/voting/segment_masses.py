@@ -23,7 +23,7 @@ from torch import Tensor
 from splatseg import _native
 from splatseg.core import UNLABELLED, Camera, Gaussians, LabelMap, MaskSet
 from splatseg.errors import ShapeError
-from splatseg.render import SparseWeights, image_weights, weights
+from splatseg.render import SparseWeights, prepare, weights
 from splatseg.render.warp import undistorted_camera, warp_into_photograph
 
 _LAYERS = 12
@@ -324,7 +324,9 @@ def _sums(
     pinhole = undistorted_camera(camera)
     bands = list(_bands(pinhole.height * pinhole.width))
     if len(bands) == 1 and camera.is_pinhole and weight is None:
-        return _image_sums(runs, gaussians, camera, backend=backend), None
+        with prepare(gaussians, camera, backend=backend) as view:
+            sums = view.part_sums([torch.from_numpy(pieces.piece) for pieces in runs])
+        return [[own] for own in sums], None
     pinhole_pixel = None if camera.is_pinhole else _pinhole_pixels(camera)
     found: list[list[Any]] = [[] for _ in runs]
     visible = torch.zeros(len(gaussians))
@@ -335,22 +337,6 @@ def _sums(
         if weight is not None:
             visible += _visible(rows, band, pinhole_pixel)
     return found, None if weight is None else visible
-
-
-def _image_sums(
-    runs: Sequence[Pieces], gaussians: Gaussians, camera: Camera, *, backend: str
-) -> list[list[Any]]:
-    """The sums of a whole image, one band: the faster way, without rows of pixels."""
-    import scipy.sparse
-
-    image = image_weights(gaussians, camera, backend=backend)
-    found: list[list[Any]] = []
-    for pieces in runs:
-        sums = image.part_sums(torch.from_numpy(pieces.piece).to(gaussians.device))
-        columns = (sums.sums.cpu().numpy(), sums.ids.cpu().numpy(), sums.indptr.cpu().numpy())
-        shape = (pieces.segments.shape[1], len(gaussians))
-        found.append([scipy.sparse.csr_matrix(columns, shape=shape)])
-    return found
 
 
 def _band_pieces(pieces: Pieces, band: slice, pinhole_pixel: NDArray[np.int64] | None) -> Any:

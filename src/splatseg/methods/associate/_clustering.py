@@ -94,7 +94,9 @@ def join_pairs(
     return rows, sums.indices, sums.data
 
 
-def seen_by(seen: Any, members: Any, one: NDArray[Any], other: NDArray[Any]) -> NDArray[np.float64]:
+def visible_in(
+    seen: Any, members: Any, one: NDArray[Any], other: NDArray[Any]
+) -> NDArray[np.float64]:
     """What the views of the segments of one group see of the other, for pairs.
 
     Args:
@@ -264,8 +266,8 @@ class _Candidates:
     def _some_ratios(
         self, row: NDArray[Any], column: NDArray[Any], shared: NDArray[Any]
     ) -> NDArray[np.float64]:
-        union = seen_by(self.seen, self.members, row, column)
-        union += seen_by(self.seen, self.members, column, row) - shared
+        union = visible_in(self.seen, self.members, row, column)
+        union += visible_in(self.seen, self.members, column, row) - shared
         ratio = shared / np.maximum(union, 1e-12)
         enough = np.flatnonzero(ratio >= self._threshold)
         joins = enough[self._compatible(row[enough], column[enough])]

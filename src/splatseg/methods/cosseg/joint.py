@@ -32,7 +32,6 @@ from splatseg.core import (
     camera_of_map,
 )
 from splatseg.core.boundary import boundary
-from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError
 from splatseg.fit import FitOptions, Refinement
 from splatseg.lift.training import TrainingResult
@@ -186,8 +185,7 @@ def train_jointly(
     )
     for done in range(steps):
         run.step(loss)
-        with one_torch_thread():
-            loss.update()
+        loss.update()
         if progress is not None:
             progress(done + 1, steps)
     return run.gaussians()

@@ -7,8 +7,7 @@ The block of a level is its local feature aggregation, section 3.3.
 .. math:: r_{ik} = \mathrm{MLP}(\lVert p_i - p_k \rVert, p_i - p_k, p_i, p_k),
 
 which the paper writes in the order :math:`(p_i, p_k, p_i - p_k, \lVert p_i - p_k \rVert)`; that
-of the authors' code is kept here, and readers of checkpoints permute columns where another one was
-used. The ten channels are linear in seven: a layer A of them is
+of the authors' code is kept here. The ten channels are linear in seven: a layer A of them is
 
 .. math:: A (\ldots) = a_d \lVert o \rVert + (A_o - A_n) o + (A_p + A_n) p_i, \quad o = p_i - p_k,
 
@@ -41,12 +40,14 @@ from torch.nn import functional
 from splatseg import _native
 from splatseg._check import check_finite, check_shape
 from splatseg.core.boundary import boundary
-from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError
-from splatseg.methods.cosseg.pyramid import PointPyramid, RandlaConfig, RandlaVariant
+from splatseg.methods.cosseg.pyramid import PointPyramid, RandlaConfig
 
 MOMENTUM = 0.01
 """Share of a batch in the running statistics of batch norms: 0.99 of the old ones stays."""
+
+SLOPE, EPSILON = 0.2, 1e-6
+"""Slope of LeakyReLUs below 0, and what is added to variances, as in the authors' code."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -77,13 +78,12 @@ class SharedMlp(nn.Module):
         inputs: Channels of x.
         outputs: Channels of the result.
         slope: Of the LeakyReLU below 0; 1 is none.
-        epsilon: Added to variances.
     """
 
-    def __init__(self, inputs: int, outputs: int, *, slope: float, epsilon: float) -> None:
+    def __init__(self, inputs: int, outputs: int, *, slope: float = SLOPE) -> None:
         super().__init__()
         self.linear = nn.Linear(inputs, outputs)
-        self.norm = nn.BatchNorm1d(outputs, eps=epsilon, momentum=MOMENTUM)
+        self.norm = nn.BatchNorm1d(outputs, eps=EPSILON, momentum=MOMENTUM)
         self.slope = slope
 
     def affine(self) -> Affine:
@@ -124,8 +124,6 @@ Make = Callable[[Int32[Tensor, "k m"], slice], Float[Tensor, "m channels"]]
 
 VALUES = 1 << 18
 """Numbers of the largest array of a block."""
-DEVICE_VALUES = 1 << 26
-"""The same on a device, which takes no less time for less work."""
 MIN_POINTS = 16
 """Points of a block at least: shorter products of matrices cost more than they save."""
 
@@ -146,11 +144,9 @@ def in_blocks(
     """
     if is_recorded:
         return make(neighbours.T.contiguous(), slice(0, len(neighbours)))
-    on_cpu = neighbours.device.type == "cpu"
-    values = VALUES if on_cpu else DEVICE_VALUES
-    size = max(MIN_POINTS, values // (width * neighbours.shape[1]))
+    size = max(MIN_POINTS, VALUES // (width * neighbours.shape[1]))
     rows = [slice(start, start + size) for start in range(0, len(neighbours), size)]
-    threads = min(_native.threads() if on_cpu else 1, len(rows))
+    threads = min(_native.threads(), len(rows))
     call = partial(_made, make, neighbours)
     if threads == 1:
         return _filled(len(neighbours), rows, map(call, rows))
@@ -184,15 +180,13 @@ class AttentivePooling(nn.Module):
     Args:
         features: Channels of the features; their encoding has as many.
         outputs: Channels of the result.
-        variant: Slope and epsilon; whose features.
     """
 
-    def __init__(self, features: int, outputs: int, *, variant: RandlaVariant) -> None:
+    def __init__(self, features: int, outputs: int) -> None:
         super().__init__()
         width = 2 * features
         self.score = nn.Linear(width, width, bias=False)
-        self.mlp = SharedMlp(width, outputs, slope=variant.slope, epsilon=variant.epsilon)
-        self.is_own = variant.paired_features == "own"
+        self.mlp = SharedMlp(width, outputs)
 
     def entries(self, features: Float[Tensor, "m half"]) -> Float[Tensor, "m half+width"]:
         """Features and their part of the scores, side by side: one gather brings both."""
@@ -202,12 +196,7 @@ class AttentivePooling(nn.Module):
     def over(self, table: Float[Tensor, "n half+width"]) -> "Pooling":
         """The pooling of a level, given the entries of its points."""
         half = self.score.in_features // 2
-        return Pooling(
-            table=table,
-            weight=self.score.weight[:, half:],
-            mlp=self.mlp.affine(),
-            is_own=self.is_own,
-        )
+        return Pooling(table=table, weight=self.score.weight[:, half:], mlp=self.mlp.affine())
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -223,24 +212,17 @@ class Pooling:
     mlp: Affine
     """What follows."""
 
-    is_own: bool
-    """Whether the features are those of the point itself."""
-
     def __call__(
-        self, encoding: Float[Tensor, "k m half"], near: Int32[Tensor, "k m"], rows: slice
+        self, encoding: Float[Tensor, "k m half"], near: Int32[Tensor, "k m"]
     ) -> Float[Tensor, "m outputs"]:
         """Pool the neighbours of some points.
 
         Args:
             encoding: Spatial encoding of their neighbours.
             near: Rows of their neighbours.
-            rows: The points.
         """
         k, m, half = encoding.shape
-        if self.is_own:
-            seen = self.table[rows].expand(k, m, -1)
-        else:
-            seen = self.table.index_select(0, near.reshape(-1)).reshape(k, m, -1)
+        seen = self.table.index_select(0, near.reshape(-1)).reshape(k, m, -1)
         features, scores = seen.split((half, 2 * half), dim=-1)
         pairs = torch.addmm(
             scores.reshape(k * m, -1), encoding.reshape(k * m, half), self.weight.T
@@ -261,23 +243,20 @@ class ResidualBlock(nn.Module):
     Args:
         inputs: Channels of the features of the level.
         width: d, even; the result has 2 d channels.
-        variant: In what it differs from the authors' code.
+        sum_slope: `RandlaConfig.sum_slope`.
     """
 
-    def __init__(self, inputs: int, width: int, *, variant: RandlaVariant) -> None:
+    def __init__(self, inputs: int, width: int, *, sum_slope: float) -> None:
         super().__init__()
-        half, epsilon = width // 2, variant.epsilon
-        chained = variant.second_encoding == "chained"
-        self.entry = SharedMlp(inputs, half, slope=variant.entry_slope, epsilon=epsilon)
-        self.encode1 = SharedMlp(10, half, slope=variant.slope, epsilon=epsilon)
-        self.pool1 = AttentivePooling(half, half, variant=variant)
-        self.encode2 = SharedMlp(
-            half if chained else 10, half, slope=variant.slope, epsilon=epsilon
-        )
-        self.pool2 = AttentivePooling(half, width, variant=variant)
-        self.exit = SharedMlp(width, 2 * width, slope=1, epsilon=epsilon)
-        self.shortcut = SharedMlp(inputs, 2 * width, slope=1, epsilon=epsilon)
-        self.variant = variant
+        half = width // 2
+        self.entry = SharedMlp(inputs, half)
+        self.encode1 = SharedMlp(10, half)
+        self.pool1 = AttentivePooling(half, half)
+        self.encode2 = SharedMlp(half, half)
+        self.pool2 = AttentivePooling(half, width)
+        self.exit = SharedMlp(width, 2 * width, slope=1)
+        self.shortcut = SharedMlp(inputs, 2 * width, slope=1)
+        self.sum_slope = sum_slope
 
     def forward(
         self,
@@ -291,11 +270,10 @@ class ResidualBlock(nn.Module):
         3 d numbers a point; otherwise for some 10 d of each pair of neighbours.
         """
         recorded = self.training or torch.is_grad_enabled()
-        squared = self.variant.distance == "squared"
-        first = _encoder(self.encode1.affine(), positions, squared=squared)
+        first = _encoder(self.encode1.affine(), positions)
         if recorded:  # a batch norm counts what it sees
             first = _once(first)
-        second = self._second(first, positions, squared=squared)
+        second = self.encode2.affine()
 
         def made(make: Make) -> Tensor:
             width = self.exit.linear.in_features
@@ -304,40 +282,29 @@ class ResidualBlock(nn.Module):
         entry = self.entry.affine()
         pool1 = self.pool1.over(made(lambda _, rows: self.pool1.entries(entry(features[rows]))))
         pool2 = self.pool2.over(
-            made(lambda near, rows: self.pool2.entries(pool1(first(near, rows), near, rows)))
+            made(lambda near, rows: self.pool2.entries(pool1(first(near, rows), near)))
         )
-        leave, shortcut, slope = self.exit.affine(), self.shortcut.affine(), self.variant.sum_slope
+        leave, shortcut = self.exit.affine(), self.shortcut.affine()
 
         def left(near: Tensor, rows: slice) -> Tensor:
-            found = leave(pool2(second(near, rows), near, rows)) + shortcut(features[rows])
-            return functional.leaky_relu_(found, slope)
+            found = leave(pool2(second(first(near, rows)), near)) + shortcut(features[rows])
+            return functional.leaky_relu_(found, self.sum_slope)
 
         return made(left)
-
-    def _second(self, first: Encode, positions: Tensor, *, squared: bool) -> Encode:
-        affine = self.encode2.affine()
-        if self.variant.second_encoding == "chained":
-            return lambda near, rows: affine(first(near, rows))
-        return _encoder(affine, positions, squared=squared)
 
 
 def sample(
     features: Float[Tensor, "n channels"],
     neighbours: Int32[Tensor, "n k"],
     kept: Int64[Tensor, "m"],
-    *,
-    variant: RandlaVariant,
 ) -> Float[Tensor, "m channels"]:
-    """What the points that a level keeps take to the next one.
+    """What the points that a level keeps take to the next one: the maximum over their neighbours.
 
     Args:
         features: Of the level.
         neighbours: Of its points.
         kept: Rows of the points that are kept.
-        variant: The maximum over neighbours, or their own.
     """
-    if variant.sampling == "own":
-        return features[kept]
     width, recorded = features.shape[1], torch.is_grad_enabled()
 
     def largest(near: Tensor, _: slice) -> Tensor:
@@ -346,7 +313,7 @@ def sample(
     return in_blocks(largest, neighbours[kept], width=width, is_recorded=recorded)
 
 
-def _encoder(affine: Affine, positions: Tensor, *, squared: bool) -> Encode:
+def _encoder(affine: Affine, positions: Tensor) -> Encode:
     """The local spatial encoding of some points, by the seven channels that the ten are made of."""
     of_distance, of_offset, of_point, of_neighbour = affine.weight.split((1, 3, 3, 3), dim=1)
     of_pair = torch.cat((of_distance, of_offset - of_neighbour), dim=1).T
@@ -357,9 +324,7 @@ def _encoder(affine: Affine, positions: Tensor, *, squared: bool) -> Encode:
         seen = columns.index_select(1, near.reshape(-1)).reshape(3, *near.shape)
         offset = columns[:, None, rows] - seen
         x, y, z = offset
-        distance = x * x + y * y + z * z
-        if not squared:
-            distance = distance.sqrt()
+        distance = (x * x + y * y + z * z).sqrt()
         pairs = torch.cat((distance[None], offset)).reshape(4, -1).T @ of_pair
         return affine.finish(pairs.reshape(*near.shape, -1) + points[rows])
 
@@ -403,13 +368,10 @@ class RandlaEncoder(nn.Module):
     def __init__(self, config: RandlaConfig) -> None:
         super().__init__()
         self.config = config
-        variant = config.variant
-        self.start = SharedMlp(
-            config.inputs, config.first_width, slope=variant.start_slope, epsilon=variant.epsilon
-        )
+        self.start = SharedMlp(config.inputs, config.first_width)
         before = (config.first_width, *(2 * width for width in config.widths))
         self.blocks = nn.ModuleList(
-            ResidualBlock(inputs, width, variant=variant)
+            ResidualBlock(inputs, width, sum_slope=config.sum_slope)
             for inputs, width in zip(before, config.widths, strict=False)
         )
 
@@ -443,7 +405,7 @@ class RandlaEncoder(nn.Module):
             )
         if self.training or (torch.is_grad_enabled() and self._has_gradients(inputs)):
             return self._levels(pyramid, inputs)
-        with torch.no_grad(), one_torch_thread():
+        with torch.no_grad():
             return self._levels(pyramid, inputs)
 
     def _has_gradients(self, inputs: Tensor) -> bool:
@@ -457,83 +419,6 @@ class RandlaEncoder(nn.Module):
             found = block(positions, features, pyramid.neighbours[level])
             if level == 0:
                 levels.append(found)
-            features = sample(
-                found, pyramid.neighbours[level], pyramid.pool[level], variant=self.config.variant
-            )
+            features = sample(found, pyramid.neighbours[level], pyramid.pool[level])
             levels.append(features)
         return tuple(levels)
-
-
-_HEAD = (64, 32)
-"""Channels of the head's two layers."""
-_DROPPED = 0.5
-"""Share of channels that the head drops while training."""
-
-
-class RandlaNet(nn.Module):
-    """RandLA-Net (Hu et al. 2020, figure 7): logits of points.
-
-    The decoder goes from the last level to level 0. At each step features go from the nearest
-    point of the coarser level to the points of the finer one, stand behind what the encoder
-    found there (a skip), and pass one layer. The head's two layers, drop-out and a linear layer
-    follow.
-
-    Args:
-        config: Its shape.
-
-    Example:
-        >>> from splatseg.methods.cosseg.pyramid import PyramidOptions, point_pyramid
-        >>> config = RandlaConfig(inputs=3, widths=(4, 8), neighbours=4, ratios=(2, 2), classes=5)
-        >>> points = torch.rand(64, 3)
-        >>> options = PyramidOptions(neighbours=4, ratios=(2, 2))
-        >>> pyramid = point_pyramid(points, options=options, seed=0)
-        >>> RandlaNet(config).eval()(pyramid, points).shape
-        torch.Size([64, 5])
-    """
-
-    @boundary
-    def __init__(self, config: RandlaConfig) -> None:
-        super().__init__()
-        self.config = config
-        self.encoder = RandlaEncoder(config)
-        widths = config.level_widths
-        slope, epsilon = config.variant.slope, config.variant.epsilon
-
-        def layer(inputs: int, outputs: int) -> SharedMlp:
-            return SharedMlp(inputs, outputs, slope=slope, epsilon=epsilon)
-
-        self.middle = layer(widths[-1], widths[-1])
-        # A step ends with as many channels as its skip has.
-        befores = (widths[-1], *widths[-2:0:-1])
-        self.steps = nn.ModuleList(
-            layer(skip + before, skip) for skip, before in zip(widths[-2::-1], befores, strict=True)
-        )
-        self.head = nn.Sequential(
-            layer(widths[0], _HEAD[0]),
-            layer(*_HEAD),
-            nn.Dropout(_DROPPED),
-            nn.Linear(_HEAD[1], config.classes),
-        )
-
-    @boundary
-    def forward(
-        self, pyramid: PointPyramid, inputs: Float[Tensor, "n channels"]
-    ) -> Float[Tensor, "n classes"]:
-        """Logits of the classes of each point.
-
-        Args:
-            pyramid: The points, see `RandlaEncoder.forward`.
-            inputs: Channels of each point.
-
-        Raises:
-            ShapeError: If `inputs` has not a row a point or the wrong channels.
-            RangeError: If a value is not finite.
-            InputError: If the pyramid has another number of levels.
-        """
-        levels = self.encoder(pyramid, inputs)
-        features = self.middle(levels[-1])
-        for step, skip, up in zip(
-            self.steps, reversed(levels[:-1]), reversed(pyramid.up), strict=True
-        ):
-            features = step(torch.cat((skip, features[up]), dim=1))
-        return self.head(features)

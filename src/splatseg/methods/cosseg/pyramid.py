@@ -1,8 +1,7 @@
 """The points of a RandLA-Net: its shape, how it is fed, and random subsets with neighbours."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
@@ -36,47 +35,6 @@ _QUERIES = 1 << 17
 
 _MAX_POINTS = (1 << 31) - 1
 """Rows that 32 bits can tell apart."""
-
-
-@options
-class RandlaVariant:
-    """In what implementations of RandLA-Net differ that no reordering of weights undoes.
-
-    The defaults are those of the authors' own code (Hu et al., github.com/QingyongHu/RandLA-Net).
-    Three further differences are undone when a checkpoint is read, exactly: the order of the ten
-    channels of the spatial encoding, which comes first where features and encoding are
-    concatenated, and a constant in the scores of attention, which their softmax takes away.
-    """
-
-    distance: Literal["euclidean", "squared"] = "euclidean"
-    """The first of the ten channels: the distance to the neighbour, or its square."""
-
-    second_encoding: Literal["chained", "direct"] = "chained"
-    """What the second spatial encoding of a block is made from: the first one, or the ten channels
-    again."""
-
-    paired_features: Literal["neighbour", "own"] = "neighbour"
-    """Whose features stand beside the encoding of a neighbour: the neighbour's, as in the paper, or
-    the point's own, once for each neighbour."""
-
-    sampling: Literal["max", "own"] = "max"
-    """What a point that is kept takes to the next level: the maximum over its neighbours, as in the
-    authors' code, or its own features, as in the paper's figure."""
-
-    start_slope: Share = 0.2
-    """Slope below 0 of the LeakyReLU after the first layer, in [0, 1]; 0 is a ReLU."""
-
-    entry_slope: Share = 0.2
-    """The same after the layer that a block begins with."""
-
-    slope: Share = 0.2
-    """The same after spatial encodings and attentive poolings."""
-
-    sum_slope: Share = 0.2
-    """The same after the sum of a block and its shortcut."""
-
-    epsilon: Annotated[float, Meta(gt=0, lt=1)] = 1e-6
-    """Added to the variances of batch norms, above 0."""
 
 
 @options
@@ -117,8 +75,9 @@ class RandlaConfig(PyramidOptions):
     classes: Width = 13
     """Classes of the network's own head; an encoder has none."""
 
-    variant: RandlaVariant = field(default_factory=RandlaVariant)
-    """In what it differs from the authors' code."""
+    sum_slope: Share = 0.2
+    """Slope below 0 of the LeakyReLU after the sum of a block and its shortcut: 0.2 in the authors'
+    code (github.com/QingyongHu/RandLA-Net), 0.01 in Open3D-ML's."""
 
     def __post_init__(self) -> None:
         if not 1 <= len(self.widths) <= MAX_LEVELS:
@@ -274,16 +233,6 @@ class PointPyramid:
         """Points of each level."""
         return tuple(len(rows) for rows in self.kept)
 
-    def to(self, device: torch.device | str) -> "PointPyramid":
-        """The pyramid on another device."""
-        return PointPyramid(
-            positions=self.positions.to(device),
-            kept=tuple(one.to(device) for one in self.kept),
-            neighbours=tuple(one.to(device) for one in self.neighbours),
-            pool=tuple(one.to(device) for one in self.pool),
-            up=tuple(one.to(device) for one in self.up),
-        )
-
 
 @boundary
 def point_pyramid(
@@ -337,42 +286,6 @@ def point_pyramid(
         neighbours=tuple(neighbours),
         pool=tuple(pool),
         up=tuple(up),
-    )
-
-
-@boundary
-def join_pyramids(pyramids: Sequence[PointPyramid]) -> PointPyramid:
-    """Several pyramids as one, for a batch: no point sees a point of another one.
-
-    Args:
-        pyramids: At least one, of the same options. Rows of level 0 follow each other.
-
-    Raises:
-        InputError: If there is none, or their levels or neighbours differ in number.
-    """
-    if not pyramids:
-        raise InputError("pyramids: expected at least one, got none.")
-    shapes = sorted({tuple(near.shape[1] for near in one.neighbours) for one in pyramids})
-    if len(shapes) > 1:
-        raise InputError(
-            "pyramids: expected the same levels with as many neighbours, got neighbours "
-            f"{' and '.join(str(list(shape)) for shape in shapes)}."
-        )
-    starts = np.cumsum([[0] * (len(shapes[0]) + 1), *(p.sizes for p in pyramids)], axis=0)[:-1]
-
-    def joined(name: str, ahead: int, level: int) -> Tensor:
-        """A field at a level, of which the values are rows of the level so many ahead."""
-        parts = (getattr(one, name)[level] for one in pyramids)
-        shifts = (int(start[level + ahead]) for start in starts)
-        return torch.cat([part + shift for part, shift in zip(parts, shifts, strict=True)])
-
-    levels = range(len(shapes[0]))
-    return PointPyramid(
-        positions=torch.cat([one.positions for one in pyramids]),
-        kept=tuple(joined("kept", -level, level) for level in range(len(shapes[0]) + 1)),
-        neighbours=tuple(joined("neighbours", 0, level) for level in levels),
-        pool=tuple(joined("pool", 0, level) for level in levels),
-        up=tuple(joined("up", 1, level) for level in levels),
     )
 
 

@@ -15,7 +15,6 @@ from torch import Tensor
 from splatseg.core import ClassTable, Features, Gaussians, LabelSource, View
 from splatseg.core.boundary import boundary
 from splatseg.core.rigid import upright
-from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError
 from splatseg.lift.label_maps import Blend, ClassifierHead
 from splatseg.lift.training import TrainingResult, held_out_views
@@ -149,10 +148,9 @@ def prepare(
         up=up,
         seed=context.seed,
     )
-    with one_torch_thread():
-        whole = source.raw(chosen)
-        scalings = whole.scalings()
-        everything = whole.scaled(scalings, len(gaussians))
+    whole = source.raw(chosen)
+    scalings = whole.scalings()
+    everything = whole.scaled(scalings, len(gaussians))
     return Prepared(
         chosen=chosen,
         distilled=distilled,
@@ -261,8 +259,7 @@ def _points(
     def make(views: Sequence[View], index: int) -> PointSet:
         counts = view_pixel_counts(gaussians, views[index], blending, context.backend)
         shown = torch.nonzero((counts > 0) & is_chosen).squeeze(1)
-        with one_torch_thread():
-            return prepared.source.raw(shown).scaled(prepared.scalings, len(gaussians))
+        return prepared.source.raw(shown).scaled(prepared.scalings, len(gaussians))
 
     kept, held_out = held_out_views(views, options.held_out)
     with (
@@ -274,8 +271,7 @@ def _points(
 
 def decoded_together(points: PointSet, weights: Weights) -> Float[Tensor, "n channels"]:
     """What is decoded of each Gaussian of the scene among these; 0 of those that are not."""
-    with one_torch_thread():
-        decoded = decode_all(points.inputs, weights)
+    decoded = decode_all(points.inputs, weights)
     there = points.rows >= 0
     values = torch.zeros(len(there), decoded.shape[1])
     values[there] = decoded[points.rows[there]]

@@ -350,7 +350,7 @@ def _with_classes(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class OwnShare:
+class SelfAgreement:
     """How much of the answer are a Gaussian's own votes, and why."""
 
     share: float
@@ -360,7 +360,7 @@ class OwnShare:
     heterogeneity: float
 
 
-def own_share(options: ObjectLabelOptions, objects: Labels, votes: Labels) -> OwnShare:
+def own_share(options: ObjectLabelOptions, objects: Labels, votes: Labels) -> SelfAgreement:
     """Lambda, as given or from how the votes err.
 
     Args:
@@ -374,7 +374,9 @@ def own_share(options: ObjectLabelOptions, objects: Labels, votes: Labels) -> Ow
         share = between / MAX_HETEROGENEITY - 1
         if correlation is not None:
             share = max(share, 1 - correlation / MAX_CORRELATION)
-    return OwnShare(share=min(1.0, max(0.0, share)), correlation=correlation, heterogeneity=between)
+    return SelfAgreement(
+        share=min(1.0, max(0.0, share)), correlation=correlation, heterogeneity=between
+    )
 
 
 def spread(
@@ -383,7 +385,7 @@ def spread(
     pooled: PooledObjects,
     probabilities: Tensor,
     *,
-    own: OwnShare,
+    own: SelfAgreement,
     candidates: int,
 ) -> Labels:
     """Classes of objects on the Gaussians by their shares, and what own votes say.

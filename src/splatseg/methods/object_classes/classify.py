@@ -33,7 +33,6 @@ from torch import Tensor
 
 from splatseg.core import UNLABELLED, Labels
 from splatseg.core.boundary import boundary
-from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError, RangeError, ShapeError
 
 VOTE_EXPONENT = 2.0
@@ -274,8 +273,7 @@ def with_categories(
     sums = taken.sum(dim=1, keepdim=True)
     taken /= torch.where(sums > 0, sums, 1.0)
     votes = pooled.votes * (sums > 0).T
-    with one_torch_thread():
-        answers = _answers(votes, taken * votes.sum(dim=0)[:, None])
+    answers = _answers(votes, taken * votes.sum(dim=0)[:, None])
     return replace(
         pooled,
         classes=torch.tensor(classes, dtype=torch.int64),
@@ -304,11 +302,6 @@ def classify_objects(objects: PooledObjects) -> Float[Tensor, "objects classes"]
 
     The result does not depend on the number of threads.
     """
-    with one_torch_thread():
-        return _classified(objects)
-
-
-def _classified(objects: PooledObjects) -> Tensor:
     total = objects.votes.sum(dim=1)
     voted = total > 0
     found = torch.zeros_like(objects.votes)

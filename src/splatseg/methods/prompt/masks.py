@@ -228,17 +228,19 @@ def mask_overlaps(
     import scipy.sparse
 
     roots: list[Any] = []
-    sights: list[Any] = []
+    visibility_of_masks: list[Any] = []
     for at, found in enumerate(held):
         own = np.array([index for view, index in rows if view == at], dtype=np.int64)
         segment, gaussian = found.segment.numpy(), found.gaussian.numpy()
         count = max(int(own.max(initial=-1)), int(segment.max(initial=-1))) + 1
         entries = (found.weight.double().sqrt().numpy(), (segment, gaussian))
         roots.append(scipy.sparse.csr_matrix(entries, shape=(count, gaussians))[own])
-        sights.append(scipy.sparse.csr_matrix(found.visible.double().sqrt().numpy()[None]))
+        visibility_of_masks.append(
+            scipy.sparse.csr_matrix(found.visible.double().sqrt().numpy()[None])
+        )
     masks: Any = scipy.sparse.vstack(roots, format="csr")
     shared = np.asarray((masks @ masks.T).todense())
-    seen = np.asarray((masks @ scipy.sparse.vstack(sights, format="csr").T).todense())
+    seen = np.asarray((masks @ scipy.sparse.vstack(visibility_of_masks, format="csr").T).todense())
     # Of each mask, what the view of each other mask sees.
     size = seen[:, [view for view, _ in rows]]
     iou = shared / np.maximum(size + size.T - shared, 1e-9)

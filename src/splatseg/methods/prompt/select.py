@@ -30,7 +30,7 @@ from splatseg.methods.prompt.masks import PromptedMasks
 from splatseg.methods.prompt.options import PromptOptions, VoteRule
 from splatseg.methods.prompt.views import (
     lifted,
-    points_around,
+    neighbouring_points,
     points_inside,
     projected_views,
     seed_of,
@@ -240,7 +240,7 @@ def sampled_points(
         generator = torch.Generator().manual_seed(seed_of(seed, f"{key}:{view.name}"))
         mask = rle.decode()
         inside = points_inside(mask, POINTS, how=options.sampling, generator=generator)
-        around = points_around(mask, NEGATIVES if options.sampling == "inside" else 0)
+        around = neighbouring_points(mask, NEGATIVES if options.sampling == "inside" else 0)
         signs = torch.arange(len(inside) + len(around)) < len(inside)
         pixels = torch.cat((inside, around))
         points.append(ViewPoints(view=view, pixels=pixels, positive=signs, area=rle.area))

@@ -27,10 +27,10 @@ from splatseg.methods.prompt.select import (
 )
 from splatseg.methods.prompt.views import initial_views
 from splatseg.methods.prompt.words import (
-    CellAnswers,
+    CellMatches,
     FoundObject,
-    GroundedAnswers,
-    MaskAnswers,
+    GroundedMatches,
+    MaskMatches,
     WordAnswering,
 )
 
@@ -183,7 +183,7 @@ class PromptSession:
     def _answering(self) -> WordAnswering:
         options, sources = self._options, self._sources
         if sources.grounder is not None:
-            return GroundedAnswers(
+            return GroundedMatches(
                 self._gaussians, self.initial, sources.grounder, options, backend=self._backend
             )
         vocabulary = self.vocabulary
@@ -201,8 +201,8 @@ class PromptSession:
             backend=self._backend,
         )
         if options.region == "cells":
-            return CellAnswers(table, sources.features, vocabulary, options)
-        return MaskAnswers(table, vocabulary, options)
+            return CellMatches(table, sources.features, vocabulary, options)
+        return MaskMatches(table, vocabulary, options)
 
     @boundary
     def find(self, word: str) -> list[FoundObject]:

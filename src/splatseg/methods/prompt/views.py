@@ -228,7 +228,7 @@ def points_inside(
     return _spread_pixels(_distance(mask), mask, count)
 
 
-def points_around(mask: Bool[Tensor, "height width"], count: int) -> Float[Tensor, "k 2"]:
+def neighbouring_points(mask: Bool[Tensor, "height width"], count: int) -> Float[Tensor, "k 2"]:
     """Points close to a mask and not in it, far from each other; none where there is no room.
 
     Args:

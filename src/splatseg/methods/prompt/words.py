@@ -1,15 +1,15 @@
 """Words to masks in the initial views: by recorded features and masks, or by a grounding model.
 
-`MaskAnswers` asks every recorded mask. Its feature is told apart from its neighbours', those of one
+`MaskMatches` asks every recorded mask. Its feature is told apart from its neighbours', those of one
 thing in several views are averaged, and words are compared with them in their span, each held
 against what else a thing could be (`lift.words`).
 
-`CellAnswers` is the plain way. In each view alone, the relevancy of a word in the cells of the
+`CellMatches` is the plain way. In each view alone, the relevancy of a word in the cells of the
 feature map (`lift.relevancy`) has its maximum at some cell; the region is what hangs together with
 it above the middle between the maximum and the median. The recorded mask with the best IoU with the
 region is taken.
 
-`GroundedAnswers` asks a model, such as LangSAM (Grounding DINO and SAM), as published: of its masks
+`GroundedMatches` asks a model, such as LangSAM (Grounding DINO and SAM), as published: of its masks
 the surest of each view.
 """
 
@@ -25,11 +25,11 @@ from torch import Tensor
 from splatseg.core import FeatureSource, Gaussians, MaskSet, Rle, View
 from splatseg.core.models import GroundedMasks, Image
 from splatseg.errors import InputError
-from splatseg.lift.phrases import answer_phrases
+from splatseg.lift.phrases import match_phrases
 from splatseg.lift.vocabulary import Vocabulary, relevancy
 from splatseg.lift.voting.features import checked_grid
 from splatseg.lift.voting.segment_masses import view_masses
-from splatseg.lift.words import TEMPERATURE, WordAnswers, answer_words, context_of, word_span
+from splatseg.lift.words import TEMPERATURE, WordMatches, context_of, match_words, word_span
 from splatseg.methods.prompt.masks import MaskTable, image_of, mask_overlaps
 from splatseg.methods.prompt.options import PromptOptions
 
@@ -125,7 +125,7 @@ def mask_groups(table: MaskTable) -> MaskGroups:
 def answering(
     table: MaskTable,
     groups: MaskGroups,
-    answers: WordAnswers,
+    answers: WordMatches,
     *,
     several: bool,
     least: float,
@@ -169,7 +169,7 @@ def answering(
     return found
 
 
-def _whole(table: MaskTable, answers: WordAnswers, best: int, least: float) -> int:
+def _whole(table: MaskTable, answers: WordMatches, best: int, least: float) -> int:
     """The row of the largest mask that holds one, and answers as well."""
     cosines, probabilities = answers.cosines[:, 0], answers.probabilities[:, 0]
     near = (cosines >= cosines[best] - _AS_GOOD) & (probabilities >= least)
@@ -204,7 +204,7 @@ class WordAnswering(Protocol):
         ...
 
 
-class MaskAnswers:
+class MaskMatches:
     """Words asked of every mask.
 
     Args:
@@ -225,7 +225,7 @@ class MaskAnswers:
         answers = self._asked(word)
         looks = self._table.looks
         if self._options.phrases == "parts" and looks is not None:
-            scores, probabilities = answer_phrases(
+            scores, probabilities = match_phrases(
                 answers,
                 lambda: looks,
                 self._vocabulary,
@@ -240,9 +240,9 @@ class MaskAnswers:
             least=self._options.probability_limit,
         )
 
-    def _asked(self, word: str) -> WordAnswers:
+    def _asked(self, word: str) -> WordMatches:
         """What each group answers to a word, or a phrase as a whole."""
-        return answer_words(
+        return match_words(
             self._groups.values,
             [word],
             self._vocabulary,
@@ -250,7 +250,7 @@ class MaskAnswers:
         )
 
 
-class CellAnswers:
+class CellMatches:
     """Words asked of the cells of the feature maps, in each view alone.
 
     Args:
@@ -344,7 +344,7 @@ class CellAnswers:
         return found
 
 
-class GroundedAnswers:
+class GroundedMatches:
     """Words asked of a model that sees the photographs of the initial views.
 
     Args:

@@ -45,7 +45,6 @@ from splatseg.core import (
 )
 from splatseg.core.boundary import boundary
 from splatseg.core.options import Share, options
-from splatseg.core.threads import one_torch_thread
 from splatseg.errors import ShapeError
 from splatseg.lift.affinity import AffinityHead
 from splatseg.neighbours import NeighbourIndex
@@ -431,11 +430,10 @@ def decompose(
     check_range("seed", seed, 0, 2**63 - 1)
     options = options or DecomposeOptions()
     rng = np.random.default_rng((seed, _SEED))
-    with one_torch_thread():
-        directed = Directed.of(gaussians, features)
-        found = objects(directed, options, rng)
-        part_of, owner = parts(directed, found.own, options, rng)
-        group_of = groups(directed, found.own, options, rng)
+    directed = Directed.of(gaussians, features)
+    found = objects(directed, options, rng)
+    part_of, owner = parts(directed, found.own, options, rng)
+    group_of = groups(directed, found.own, options, rng)
     return _tree(
         found,
         _Rows(

@@ -18,7 +18,6 @@ from splatseg.core import (
     View,
 )
 from splatseg.core.boundary import boundary
-from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError, ShapeError
 from splatseg.lift.affinity import AffinityHead
 from splatseg.lift.training import (
@@ -49,7 +48,7 @@ from splatseg.methods.saga.model import PROJECTOR, SagaModel
 from splatseg.methods.saga.options import CHANNELS, SagaOptions
 
 
-class KeptMasks:
+class StoredMasks:
     """Masks that are read once, as run lengths: a few MB for a hundred views.
 
     Args:
@@ -225,10 +224,8 @@ def train_saga(
             "got none; guidance=None trains without."
         )
     ordered = voting_views(views, evidence, "masks")
-    kept = KeptMasks(evidence)
-    # Sums in one order, and no threads for the many small ones.
-    with one_torch_thread():
-        source = SagaTargets(kept, ordered, features, grid=options.grid)
+    kept = StoredMasks(evidence)
+    source = SagaTargets(kept, ordered, features, grid=options.grid)
     rng = np.random.default_rng((context.seed, _START))
     start, levels = _started(gaussians, ordered, kept, options=options, context=context, rng=rng)
     sampler = RowSampler(
@@ -278,7 +275,7 @@ def train_saga(
 def _started(
     gaussians: Gaussians,
     views: Sequence[View],
-    evidence: KeptMasks,
+    evidence: StoredMasks,
     *,
     options: SagaOptions,
     context: TrainingContext,
@@ -290,8 +287,7 @@ def _started(
         return torch.from_numpy(drawn), None
     found = associate_masks(gaussians, views, MaskSegments(evidence), backend=context.backend)
     nodes = np.concatenate([found.nodes[view.name] for view in views])
-    with one_torch_thread():
-        start = association_start(found.tree, CHANNELS, rng)
+    start = association_start(found.tree, CHANNELS, rng)
     return start, level_masks(found.tree, torch.from_numpy(nodes))
 
 

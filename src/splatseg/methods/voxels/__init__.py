@@ -37,7 +37,7 @@ _FIXED = "it is fixed at the value that was best"
         ),
         "radius": _FILTER,
         "projection": "give `hits` itself",
-        "max_hits": "several hits of a ray were worse than `hits` weights",
+        "max_hits": "several hits of a ray were no better",
         "average": "means of views were worse than means of hits",
         **dict.fromkeys(("blur", "smoothness", "near", "far"), _FIXED),
         "assignment": "a Gaussian reads the nearest voxel",
@@ -61,7 +61,6 @@ class VoxelOptions:
 
     hits: HitRule = "solved"
     """Which cells a pixel's feature goes to. first: the first one that the ray hits, as published.
-    weights: by the weights with which Gaussians make the pixel, to the cells they are nearest to.
     solved: all cells are solved for together, with neighbours of the same colour alike."""
 
     precision: StoredPrecision = "float16"

@@ -2,8 +2,7 @@ r"""Features of pixels onto voxels: means over what shows a voxel, or all of the
 
 .. math:: f_v = \frac{\sum_{views} \sum_p h_{pv} F_p}{\sum_{views} \sum_p h_{pv}}
 
-with :math:`h_{pv}` 1 for the first voxel that the ray of pixel p hits (section 3.4 of the paper),
-or the sum of the weights of W over the Gaussians that lie nearest to it.
+with :math:`h_{pv}` 1 for the first voxel that the ray of pixel p hits (section 3.4 of the paper).
 
 A cell of a feature map is larger than what it shows, and networks spread what they see over the
 cells around it, so that such a mean mixes a voxel with all that is beside it, in every view. Solved
@@ -39,22 +38,21 @@ from scipy import sparse
 from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
+from splatseg._native import VoxelGrid as NativeGrid
 from splatseg._native import add_hit_features
 from splatseg.core import UNLABELLED, FeatureMap, FeatureSource, Gaussians, Labels, View
 from splatseg.core.boundary import boundary
 from splatseg.core.sh import base_colours
-from splatseg.core.threads import one_torch_thread
 from splatseg.core.voxels import VoxelGrid
 from splatseg.errors import InputError, ShapeError
 from splatseg.lift.label_maps import label_map
 from splatseg.lift.neighbour_graph import NodeAttributes, neighbour_graph
-from splatseg.lift.voting.features import Taps, camera_of_grid, checked_grid, grid_taps, read_grid
-from splatseg.lift.voting.uplift import RenderAdjoint, voting_views
+from splatseg.lift.voting.features import Taps, camera_of_grid, checked_grid, grid_taps
+from splatseg.lift.voting.uplift import voting_views
 from splatseg.methods.objects import pixel_cells
-from splatseg.methods.voxels.grid import GridIndex, nearest_voxels
-from splatseg.render import options_for
+from splatseg.methods.voxels.grid import nearest_voxels
 
-HitRule = Literal["first", "weights", "solved"]
+HitRule = Literal["first", "solved"]
 """See `VoxelOptions.hits`."""
 
 BLUR = 1.0
@@ -78,7 +76,7 @@ _TOLERANCE = 1e-3
 """Residual over the right side at which conjugate gradients end."""
 
 _CHANNELS = 64
-"""Channels that are summed onto Gaussians, or solved for, at a time."""
+"""Channels that are solved for at a time."""
 
 Array = NDArray[np.float32]
 
@@ -126,7 +124,7 @@ def lift_to_voxels(
         ShapeError: If a grid of features does not fit its photograph, or widths differ.
     """
     ordered = voting_views(views, evidence, "features")
-    found: _RayMeans | _WeightMeans | VoxelMixing | None = None
+    found: _RayMeans | VoxelMixing | None = None
     channels, steps = 0, len(ordered)
     for done, view in enumerate(ordered):
         features = checked_grid(view, evidence.features(view.name))
@@ -135,10 +133,12 @@ def lift_to_voxels(
             if hits == "first":
                 found = _RayMeans(grid, channels)
             else:
-                rows = nearest_voxels(grid, gaussians.means)
-                made = VoxelMixing if hits == "solved" else _WeightMeans
-                found = made(
-                    grid=grid, gaussians=gaussians, rows=rows, channels=channels, backend=backend
+                found = VoxelMixing(
+                    grid=grid,
+                    gaussians=gaussians,
+                    rows=nearest_voxels(grid, gaussians.means),
+                    channels=channels,
+                    backend=backend,
                 )
             steps += parts_of(channels) if hits == "solved" else 0
         if features.channels != channels:
@@ -160,7 +160,7 @@ class _RayMeans:
     """Means over the pixels whose rays hit a voxel first."""
 
     def __init__(self, grid: VoxelGrid, channels: int) -> None:
-        self._index = GridIndex(grid)
+        self._grid, self._native = grid, NativeGrid(grid.cells.cpu())
         self._sums = torch.zeros(len(grid), channels)
         self._totals = torch.zeros(len(grid), dtype=torch.float64)
 
@@ -168,7 +168,10 @@ class _RayMeans:
         """Add what the rays of a view hit."""
         covered, camera = camera_of_grid(view, features)
         origin, directions = camera.rays()
-        hits, _ = self._index.trace(origin, directions.reshape(-1, 3), near=_NEAR, far=_FAR)
+        start = (origin.cpu().double() - self._grid.origin) / self._grid.size
+        towards = (directions.reshape(-1, 3).cpu().double() / self._grid.size).contiguous()
+        hits = torch.empty((len(towards), 1), dtype=torch.int32)
+        self._native.trace(start, towards, _NEAR, _FAR, None, hits, None)
         down, right = (
             _packed(grid_taps(count, pixels / features.stride, size))
             for count, pixels, size in (
@@ -182,55 +185,13 @@ class _RayMeans:
 
     def result(self, _: Callable[[int], None]) -> LiftedVoxels:
         """The means."""
-        return _means(self._sums, self._totals)
+        self._sums /= torch.where(self._totals > 0, self._totals, 1.0).float()[:, None]
+        return LiftedVoxels(values=self._sums, totals=self._totals)
 
 
 def _packed(taps: Taps) -> tuple[Int32[Tensor, "2 pixels"], Float[Tensor, "pixels"]]:
     first, second, weight = taps
     return torch.stack((first, second)).to(torch.int32).contiguous(), weight.float().contiguous()
-
-
-def _means(sums: Tensor, totals: Tensor) -> LiftedVoxels:
-    """Sums, which are overwritten, over totals."""
-    sums /= torch.where(totals > 0, totals, 1.0).float()[:, None]
-    return LiftedVoxels(values=sums, totals=totals)
-
-
-class _WeightMeans:
-    """Means by W transposed, summed over the Gaussians of a voxel."""
-
-    def __init__(
-        self, *, grid: VoxelGrid, gaussians: Gaussians, rows: Tensor, channels: int, backend: str
-    ) -> None:
-        self._rows = rows
-        self._adjoint = RenderAdjoint(
-            gaussians=gaussians, options=options_for(gaussians, backend), backend=backend
-        )
-        self._sums = torch.zeros(len(grid), channels)
-        self._totals = torch.zeros(len(grid), dtype=torch.float64)
-
-    def add(self, view: View, features: FeatureMap) -> None:
-        """Add the features of a view."""
-        covered, camera = camera_of_grid(view, features)
-        values = features.features.float().cpu()
-        with self._adjoint.prepared(camera) as prepared:
-            for start in range(0, features.channels, _CHANNELS):
-                part = slice(start, start + _CHANNELS)
-                image = read_grid(
-                    values[..., part],
-                    cells=(covered[0] / features.stride, covered[1] / features.stride),
-                    size=(camera.height, camera.width),
-                )
-                sums, weights = self._adjoint.back_project(prepared, image)
-                if not start:
-                    seen = torch.zeros_like(self._totals)
-                    self._totals += seen.index_add_(0, self._rows, weights.double())
-                added = torch.zeros(len(self._sums), sums.shape[1])
-                self._sums[:, part] += added.index_add_(0, self._rows, sums)
-
-    def result(self, _: Callable[[int], None]) -> LiftedVoxels:
-        """The means."""
-        return _means(self._sums, self._totals)
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -267,8 +228,7 @@ class VoxelMixing:
         drawn = label_map(self.gaussians, camera, labels, backend=self.backend).ids
         part = _ViewShares.of(drawn.cpu().numpy(), features, len(self.grid))
         values = features.features.float().cpu().flatten(0, 1)
-        with one_torch_thread():
-            self._right += part.forth.T @ part.blurred(values, once=True).numpy()
+        self._right += part.forth.T @ part.blurred(values, once=True).numpy()
         self._features += values.double().sum(dim=0).numpy()
         self._totals += part.seen
         self._cells += len(values)
@@ -298,13 +258,12 @@ class VoxelMixing:
                 cells[own] = part.blurred(cells[own], once=False)
             return smooth @ x + np.float32(RIDGE) * x + back @ cells.numpy()
 
-        with one_torch_thread():
-            for done in range(parts_of(right.shape[1])):
-                part = slice(done * _CHANNELS, (done + 1) * _CHANNELS)
-                right[:, part] = conjugate_gradients(
-                    applied, np.ascontiguousarray(right[:, part]), scale
-                )
-                progress(done + 1)
+        for done in range(parts_of(right.shape[1])):
+            part = slice(done * _CHANNELS, (done + 1) * _CHANNELS)
+            right[:, part] = conjugate_gradients(
+                applied, np.ascontiguousarray(right[:, part]), scale
+            )
+            progress(done + 1)
         right += mean
         return LiftedVoxels(values=torch.from_numpy(right), totals=torch.from_numpy(totals))
 

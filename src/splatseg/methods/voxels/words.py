@@ -22,7 +22,6 @@ from torch import Tensor
 from splatseg._check import check_finite, check_shape
 from splatseg._native import code_sums, row_products
 from splatseg.core.boundary import boundary
-from splatseg.core.threads import one_torch_thread
 from splatseg.core.voxels import CODES, StoredPrecision, StoredTable, VoxelFeatures
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.lift.vocabulary import TextSpace, Vocabulary
@@ -30,7 +29,7 @@ from splatseg.lift.words import (
     MIN_ENERGY,
     SAME_MEANING,
     TEMPERATURE,
-    WordAnswers,
+    WordMatches,
     WordSpan,
     context_of,
     word_span,
@@ -116,8 +115,7 @@ def products(table: StoredTable, vectors: Float[Tensor, "k channels"]) -> Float3
     if table.codebooks is not None:
         parts, _, width = table.codebooks.shape
         cut = vectors.reshape(len(vectors), parts, width)
-        with one_torch_thread():
-            tables = torch.einsum("psw,kpw->kps", table.codebooks.float(), cut).contiguous()
+        tables = torch.einsum("psw,kpw->kps", table.codebooks.float(), cut).contiguous()
         code_sums(table.codes.contiguous(), tables, out)
         return out
     codes = table.codes.contiguous()
@@ -137,11 +135,10 @@ def _quantised(values: Tensor, parts: int, seed: int) -> StoredTable:
     chosen = torch.randperm(count, generator=generator)[:_TRAINING_ROWS]
     codebooks = torch.zeros(parts, CODES, width)
     codes = torch.zeros(count, parts, dtype=torch.uint8)
-    with one_torch_thread():
-        for part in range(parts):
-            rows = cut[:, part].contiguous()
-            codebooks[part] = _means(rows[chosen])
-            codes[:, part] = _nearest(rows, codebooks[part]).to(torch.uint8)
+    for part in range(parts):
+        rows = cut[:, part].contiguous()
+        codebooks[part] = _means(rows[chosen])
+        codes[:, part] = _nearest(rows, codebooks[part]).to(torch.uint8)
     return StoredTable(codes=codes, codebooks=codebooks)
 
 
@@ -239,25 +236,23 @@ class TableWords:
         """
         words = torch.nn.functional.normalize(vectors.float(), dim=1)
         if self._span is not None:
-            with one_torch_thread():
-                inside = words @ self._span.directions.T
-                energy = inside.norm(dim=1)
-                kept = energy / (energy.square() + min_energy**2).sqrt().clamp_min(_TINY)
-                scaled = torch.nn.functional.normalize(inside, dim=1) * kept[:, None]
+            inside = words @ self._span.directions.T
+            energy = inside.norm(dim=1)
+            kept = energy / (energy.square() + min_energy**2).sqrt().clamp_min(_TINY)
+            scaled = torch.nn.functional.normalize(inside, dim=1) * kept[:, None]
             return products(self._inside, scaled)
         space = self.vocabulary.space
         if space.basis is None or space.mean is None:
             found = products(self._table, words)
         else:
-            with one_torch_thread():
-                inside, constant = words @ space.basis.T.float(), words @ space.mean.float()
+            inside, constant = words @ space.basis.T.float(), words @ space.mean.float()
             found = products(self._table, inside) + constant
         inverse = torch.where(self._lengths > 0, 1 / self._lengths.clamp_min(_TINY), 0.0)
         return found * inverse[:, None]
 
     @boundary
-    def ask(self, words: Sequence[str]) -> WordAnswers:
-        """What each row answers, see `lift.words.answer_words`.
+    def ask(self, words: Sequence[str]) -> WordMatches:
+        """What each row answers, see `lift.words.match_words`.
 
         The result does not depend on the number of threads.
 
@@ -269,13 +264,12 @@ class TableWords:
         rivals = self.vocabulary.vectors(others) if others else asked[:0]
         cosines = self.cosines(asked)
         against, largest = self._against(rivals)
-        with one_torch_thread():
-            held = ((rivals @ asked.T) < SAME_MEANING).float()
-            own = TEMPERATURE * self.cosines(asked, min_energy=MIN_ENERGY)
-            own = torch.exp((own - largest[:, None]).clamp_max(_MAX_EXPONENT))
-            found = own / (own + products(against, held.T.contiguous())).clamp_min(_TINY)
+        held = ((rivals @ asked.T) < SAME_MEANING).float()
+        own = TEMPERATURE * self.cosines(asked, min_energy=MIN_ENERGY)
+        own = torch.exp((own - largest[:, None]).clamp_max(_MAX_EXPONENT))
+        found = own / (own + products(against, held.T.contiguous())).clamp_min(_TINY)
         found[self._lengths <= 0] = 0
-        return WordAnswers(
+        return WordMatches(
             words=tuple(word.strip() for word in words), cosines=cosines, probabilities=found
         )
 
@@ -304,11 +298,10 @@ class TableWords:
     def _projected(self, span: WordSpan) -> Float32[Tensor, "m directions"]:
         """Unit vectors of voxels in the span, 0 where one has no length there."""
         parts: list[Tensor] = []
-        with one_torch_thread():
-            for start in range(0, len(self._table), _AT_ONCE):
-                values = self._table.decode(slice(start, start + _AT_ONCE))
-                inside = span.space.expand(values) @ span.directions.T
-                parts.append(torch.nn.functional.normalize(inside, dim=1))
+        for start in range(0, len(self._table), _AT_ONCE):
+            values = self._table.decode(slice(start, start + _AT_ONCE))
+            inside = span.space.expand(values) @ span.directions.T
+            parts.append(torch.nn.functional.normalize(inside, dim=1))
         found = torch.cat(parts)
         found[self._lengths <= 0] = 0
         return found
@@ -355,11 +348,10 @@ class VoxelWords(TableWords):
 def _lengths(table: StoredTable, space: TextSpace) -> Float32[Tensor, "m"]:
     """Lengths of the vectors that rows stand for; 0 for rows of zeros."""
     parts: list[Tensor] = []
-    with one_torch_thread():
-        for start in range(0, len(table), _AT_ONCE):
-            values = table.decode(slice(start, start + _AT_ONCE))
-            length = space.expand(values).norm(dim=1)
-            parts.append(torch.where(values.abs().amax(dim=1) > 0, length, 0.0))
+    for start in range(0, len(table), _AT_ONCE):
+        values = table.decode(slice(start, start + _AT_ONCE))
+        length = space.expand(values).norm(dim=1)
+        parts.append(torch.where(values.abs().amax(dim=1) > 0, length, 0.0))
     return torch.cat(parts) if parts else torch.zeros(0)
 
 

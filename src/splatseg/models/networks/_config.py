@@ -22,7 +22,7 @@ from typing import Any, NoReturn, cast
 
 from splatseg.core.coerce import as_text
 from splatseg.errors import FileFormatError, quoted
-from splatseg.io.foreign import made_from, reading
+from splatseg.io.foreign import derived_from, reading
 from splatseg.io.json_files import read_json
 
 
@@ -398,7 +398,7 @@ class _Checked:
         for key, one in cast("dict[str, object]", value).items():
             if not _DIGITS.fullmatch(key) or not isinstance(one, str | int | float):
                 self._fail(name, "a name by the number of its class", {key: one})
-            with made_from(self._path):
+            with derived_from(self._path):
                 as_text(f"{name:.60}: {key}", str(one))
         return {str(int(key)): str(one) for key, one in cast("dict[str, object]", value).items()}
 

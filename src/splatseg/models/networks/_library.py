@@ -18,9 +18,9 @@ from torch import Tensor
 from splatseg.core.models import Image
 from splatseg.errors import (
     FileFormatError,
-    MissingPackageError,
     RangeError,
     SplatsegError,
+    import_package,
     quoted,
     reason,
 )
@@ -60,13 +60,7 @@ def library() -> Any:
             importlib.import_module(_UNNEEDED)
         except (ImportError, RuntimeError, OSError):
             sys.modules[_UNNEEDED] = cast(Any, None)
-    try:
-        return importlib.import_module("transformers")
-    except ImportError as error:
-        raise MissingPackageError(
-            "this model needs a package that is not installed (transformers). "
-            "Try: pip install 'splatseg[models]'."
-        ) from error
+    return import_package("transformers", "this model", "models")
 
 
 def configuration(place: Loading, kinds: Sequence[str]) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from splatseg.core.threads import network_inference
 from splatseg.errors import InputError
 from splatseg.models._images import Frame, Normalisation, frame_of, input_side
 from splatseg.models._mask_generator import distinct
-from splatseg.models._registry import own_family
+from splatseg.models._registry import family_of_sam
 from splatseg.models._weights import Loading, second_loading
 from splatseg.models.networks._library import NetworkModel, configuration, network
 from splatseg.models.networks._words import Tokens, checked_words
@@ -227,7 +227,7 @@ class LangSam(WordMasks):
     def __init__(self, name: str, options: LangSamOptions, place: Loading) -> None:
         super().__init__(name, options, place)
         self._detector = GroundingDino(name, options, place)
-        family = own_family(options.sam_model)
+        family = family_of_sam(options.sam_model)
         second = second_loading(family, options.sam_weights, place, flag="--sam-weights")
         self._segmenter = Sam(family.name, SamOptions(), second)
 

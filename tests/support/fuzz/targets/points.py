@@ -1,42 +1,24 @@
 """Checkpoints of networks of points: ours, and another program's."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 import torch
 
-from splatseg.methods.cosseg.checkpoint import (
-    load_point_encoder,
-    load_point_network,
-    save_point_encoder,
-    save_point_network,
-)
-from splatseg.methods.cosseg.network import RandlaEncoder, RandlaNet
+from splatseg.methods.cosseg.checkpoint import load_point_encoder
+from splatseg.methods.cosseg.network import RandlaEncoder
 from splatseg.methods.cosseg.pyramid import PointInputs, RandlaConfig
+from splatseg_bench.point_network import save_point_encoder
 from support.fuzz.targets.base import Target, target
 
 CONFIG = RandlaConfig(inputs=3, first_width=2, widths=(2,), neighbours=2, ratios=(2,), classes=2)
 INPUTS = PointInputs(grid_size=0.1)
 
 
-def _ours(name: str, save: Callable[[Path], None], load: Callable[[Path], object]) -> None:
-    @target(name)
-    def make(folder: Path) -> Target:
-        file = folder / "a.safetensors"
-        save(file)
-        return Target(file=file, read=lambda: load(file))
-
-
-_ours(
-    "point-encoder",
-    lambda file: save_point_encoder(RandlaEncoder(CONFIG), file, inputs=INPUTS, facts={"a": 1}),
-    load_point_encoder,
-)
-_ours(
-    "point-network",
-    lambda file: save_point_network(RandlaNet(CONFIG), file, inputs=INPUTS, facts={}),
-    load_point_network,
-)
+@target("point-encoder")
+def ours(folder: Path) -> Target:
+    file = folder / "a.safetensors"
+    save_point_encoder(RandlaEncoder(CONFIG), file, inputs=INPUTS, facts={"a": 1})
+    return Target(file=file, read=lambda: load_point_encoder(file))
 
 
 @target("point-encoder.pth")

@@ -53,7 +53,7 @@ def within(
     max_neighbours: int | None = None,
     own: Int64[Tensor, "m"] | None = None,
 ) -> NeighbourLists:
-    """What `NeighbourIndex.within` finds, and with `own` `others_within`."""
+    """What `NeighbourIndex.within` finds, and with `own` other points than these alone."""
     squared, order = _ordered(points, queries, radius, own)
     if max_neighbours is not None:
         squared, order = squared[:, :max_neighbours], order[:, :max_neighbours]
