@@ -1,6 +1,7 @@
 #include "view.h"
 
 #include <algorithm>
+#include <cmath>
 #include <cstring>
 
 #include "pool.h"
@@ -10,6 +11,7 @@ namespace {
 
 constexpr int64_t kBatchBytes = 1 << 22;  // partial sums of a batch of tiles, for each thread
 constexpr int64_t kTileScratchFloats = kTileScratchBytes / 4;
+constexpr float kUnseen = 0.45f / 255.0f;
 constexpr int kMaxDigit = 14;  // bits of a key that one pass of the sort looks at
 
 int64_t split(int64_t count, int part, int parts) { return count * part / parts; }
@@ -61,10 +63,12 @@ void View::prepare(const Cloud& cloud, const Pinhole& camera, const Blending& bl
   });
   sort_by_depth();
   bin();
+  brightest_ = -1;
 }
 
 void View::recolour(const Cloud& cloud, int32_t sh_degree) {
   blending_.sh_degree = sh_degree;
+  brightest_ = -1;
   parallel_for(visible_, 4096, [&](int64_t begin, int64_t end) {
     kernels().recolour(cloud, camera_, blending_, splats_.data(), begin, end);
   });
@@ -211,6 +215,33 @@ void View::forward_tiles(bool record, int64_t scratch_floats, const Work& work) 
   });
   evaluated_ = 0;
   for (int64_t n : evaluated) evaluated_ += n;
+}
+
+float View::brightest() {
+  if (brightest_ >= 0) return brightest_;
+  const int parts = threads();
+  std::vector<float> found(static_cast<size_t>(parts), 0.0f);
+  run_on_threads(parts, [&](int part) {
+    float most = 0;
+    const int64_t end = split(visible_, part + 1, parts);
+    for (int64_t i = split(visible_, part, parts); i < end; ++i) {
+      const Splat& s = splats_[i];
+      most = std::max({most, std::fabs(s.red), std::fabs(s.green), std::fabs(s.blue)});
+    }
+    found[static_cast<size_t>(part)] = most;
+  });
+  return brightest_ = *std::max_element(found.begin(), found.end());
+}
+
+void View::picture(const uint8_t* tint, uint8_t* image) {
+  // What a transmittance T hides is at most T times the largest colour: less than half a level.
+  const float enough = kUnseen / std::max(1.0f, brightest());
+  if (scratch_.size() < static_cast<size_t>(threads())) scratch_.resize(static_cast<size_t>(threads()));
+  parallel_for_thread(tiles(), 4, [&](int thread, int64_t begin, int64_t end) {
+    void* scratch = scratch_[static_cast<size_t>(thread)].resize(kTileScratchFloats);
+    for (int64_t tile = begin; tile < end; ++tile)
+      kernels().picture(frame_, static_cast<int>(tile), scratch, tint, enough, image);
+  });
 }
 
 void View::forward_colour(int channels, const Planes& out, bool record) {
