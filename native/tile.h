@@ -37,19 +37,18 @@ inline void start_tile(const Frame& frame, int index, Tile& tile) {
   }
 }
 
-// Loads a chunk and lists for every live block the Gaussians whose ellipse alpha >= kAlphaMin
-// touches it. The test is exact: the least value of a convex quadratic form over a rectangle
+// Which blocks the ellipse alpha >= kAlphaMin of a Gaussian touches, a bit each. The test is exact: the least value of a convex quadratic form over a rectangle
 // lies on one of the two axes through the rectangle's point nearest to the mean, where the
 // other coordinate is clamped to the rectangle. One lane is one block.
-inline void load_chunk(const Frame& frame, Tile& tile, const uint32_t* list, int count) {
-  for (int b = 0; b < 16; ++b) tile.count[b] = 0;
-  const Vec left0 = fma(set(4.0f), load(kLaneX), set(tile.x + 0.5f));
-  const Vec top0 = fma(set(4.0f), load(kLaneY), set(tile.y + 0.5f));
-  const Vec zero = set(0.0f), three = set(3.0f);
-  const uint32_t alive = tile.alive;
-  for (int k = 0; k < count; ++k) {
-    if (k + 8 < count) __builtin_prefetch(&frame.splats[list[k + 8]]);
-    const Splat& s = tile.splats[k] = frame.splats[list[k]];
+struct Touching {
+  Vec left0, top0;
+
+  explicit Touching(const Tile& tile)
+      : left0(fma(set(4.0f), load(kLaneX), set(tile.x + 0.5f))),
+        top0(fma(set(4.0f), load(kLaneY), set(tile.y + 0.5f))) {}
+
+  uint32_t operator()(const Splat& s) const {
+    const Vec zero = set(0.0f), three = set(3.0f);
     Vec left = left0 - set(s.x), right = left + three, top = top0 - set(s.y), bottom = top + three;
     Vec dx = min(max(zero, left), right), dy = min(max(zero, top), bottom);
     Vec a = set(s.a), b = set(s.b), c = set(s.c);
@@ -57,7 +56,19 @@ inline void load_chunk(const Frame& frame, Tile& tile, const uint32_t* list, int
     Vec x = min(max(set(s.slope_x) * dy, left), right);
     Vec along_y = fma(dx, fma(a, dx, b * y), c * y * y);
     Vec along_x = fma(x, fma(a, x, b * dy), c * dy * dy);
-    uint32_t hit = bits(le(min(along_y, along_x), set(s.cut))) & alive;
+    return bits(le(min(along_y, along_x), set(s.cut)));
+  }
+};
+
+// Loads a chunk and lists for every live block the Gaussians that touch it.
+inline void load_chunk(const Frame& frame, Tile& tile, const uint32_t* list, int count) {
+  for (int b = 0; b < 16; ++b) tile.count[b] = 0;
+  const Touching touching(tile);
+  const uint32_t alive = tile.alive;
+  for (int k = 0; k < count; ++k) {
+    if (k + 8 < count) __builtin_prefetch(&frame.splats[list[k + 8]]);
+    const Splat& s = tile.splats[k] = frame.splats[list[k]];
+    uint32_t hit = touching(s) & alive;
     while (hit) {
       int block = __builtin_ctz(hit);
       hit &= hit - 1;
