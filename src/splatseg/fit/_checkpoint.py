@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splatseg.core import Capture, View
+from splatseg.core import Capture, Gaussians, View
 from splatseg.core.boundary import boundary
 from splatseg.core.checkpoints import (
     DIFFERENCES,
@@ -31,7 +31,7 @@ from splatseg.core.checkpoints import (
 from splatseg.core.options import removed_options
 from splatseg.errors import FileFormatError, InputError, OutputError, brief, quoted
 from splatseg.fit._options import FitOptions
-from splatseg.fit._parameters import Parameters
+from splatseg.fit._parameters import Parameters, final_gaussians
 from splatseg.io.arrays import Npz, open_npz, write_checkpoint_file
 from splatseg.io.digests import camera_numbers, digest, file_mark
 from splatseg.io.json_files import parse_object
@@ -175,6 +175,19 @@ def checkpoint_summary(path: Path) -> CheckpointSummary:
         seconds=state.number("seconds"),
         gaussians=int(state.number("gaussians")),
     )
+
+
+@boundary
+def checkpoint_gaussians(path: Path) -> Gaussians:
+    """The Gaussians of a fit as they were when its checkpoint was written.
+
+    Raises:
+        MissingFileError: If there is no such file.
+        CheckpointVersionError: If it is of another version.
+        FileFormatError: If it is not a checkpoint, or damaged.
+    """
+    state = read_checkpoint(path)
+    return final_gaussians(parameters_of(state, "parameters", torch.device("cpu")))
 
 
 def _array(path: Path, archive: Npz, name: str) -> NDArray[Any]:
