@@ -13,8 +13,9 @@ _TOO_LONG = 1.15
 _ROOM = 0.85
 """Of these seconds: from where on frames are made smaller, and what a larger one may take."""
 
-_FRAMES = 3
-"""Frames at a size before it is judged; their median is, so that one slow frame changes nothing."""
+_FRAMES, _KEPT = 3, 5
+"""A size is judged from its third frame on, by the median of the last five: a slow frame now and
+then changes nothing."""
 
 
 class Pace:
@@ -28,7 +29,7 @@ class Pace:
 
     def __init__(self) -> None:
         self._at = 1
-        self._spent: deque[float] = deque(maxlen=_FRAMES)
+        self._spent: deque[float] = deque(maxlen=_KEPT)
 
     @property
     def scale(self) -> float:
