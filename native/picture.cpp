@@ -16,38 +16,6 @@ inline void mix(const uint8_t* tint, Splat& s) {
   s.blue = s.blue + (tint[2] * kLevel - s.blue) * much;
 }
 
-// Transposes 8 x 8 bits (Hacker's Delight, 7-3): bit i of byte k becomes bit k of byte i.
-inline uint64_t transposed(uint64_t x) {
-  uint64_t t = (x ^ x >> 7) & 0x00aa00aa00aa00aaull;
-  x ^= t ^ t << 7;
-  t = (x ^ x >> 14) & 0x0000cccc0000ccccull;
-  x ^= t ^ t << 14;
-  t = (x ^ x >> 28) & 0x00000000f0f0f0f0ull;
-  return x ^ t ^ t << 28;
-}
-
-// For each block the Gaussians of a chunk that touch it, a bit each.
-struct Masks {
-  static constexpr int kWords = kChunk / 64;
-  uint64_t words[16][kWords];
-
-  // `hits` has the blocks of each Gaussian in two bytes, low blocks first.
-  explicit Masks(const uint8_t (*hits)[kChunk]) {
-    for (int word = 0; word < kWords; ++word)
-      for (int half = 0; half < 2; ++half) {
-        uint64_t blocks[8] = {};
-        for (int eight = 0; eight < 8; ++eight) {
-          uint64_t x = 0;
-          for (int k = 0; k < 8; ++k)
-            x |= static_cast<uint64_t>(hits[half][word * 64 + eight * 8 + k]) << (8 * k);
-          x = transposed(x);
-          for (int b = 0; b < 8; ++b) blocks[b] |= (x >> (8 * b) & 0xff) << (8 * eight);
-        }
-        for (int b = 0; b < 8; ++b) words[8 * half + b][word] = blocks[b];
-      }
-  }
-};
-
 }  // namespace
 
 void picture(const Frame& frame, int index, void* scratch, const uint8_t* tint, float enough,
@@ -56,23 +24,13 @@ void picture(const Frame& frame, int index, void* scratch, const uint8_t* tint, 
   start_tile(frame, index, tile);
   alignas(64) float colour[3][16][16] = {};
   const Vec rest = set(enough);
-  const Touching touching(tile);
-  uint8_t hits[2][kChunk];
   const int64_t last = frame.tile_begin[index + 1];
   for (int64_t begin = frame.tile_begin[index]; begin < last && tile.alive; begin += kChunk) {
     const int count = static_cast<int>(last - begin < kChunk ? last - begin : kChunk);
-    const uint32_t* list = frame.tile_list + begin;
-    for (int k = 0; k < count; ++k) {
-      if (k + 8 < count) __builtin_prefetch(&frame.splats[list[k + 8]]);
-      Splat& s = tile.splats[k] = frame.splats[list[k]];
-      const uint32_t hit = touching(s);
-      hits[0][k] = static_cast<uint8_t>(hit);
-      hits[1][k] = static_cast<uint8_t>(hit >> 8);
-      if (tint) mix(tint + 4 * static_cast<int64_t>(s.id), s);
-    }
-    for (int half = 0; half < 2; ++half)
-      std::memset(hits[half] + count, 0, static_cast<size_t>(kChunk - count));
-    const Masks masks(hits);
+    const Masks masks = load_splats(frame, tile, frame.tile_list + begin, count);
+    if (tint)
+      for (int k = 0; k < count; ++k)
+        mix(tint + 4 * static_cast<int64_t>(tile.splats[k].id), tile.splats[k]);
     for (uint32_t left = tile.alive; left; left &= left - 1) {
       const int b = __builtin_ctz(left);
       Blender blender(frame, tile, b);
