@@ -133,6 +133,16 @@ def test_a_tint_of_all_needs_no_harmonics(backend, rng, camera, scene) -> None:
         assert torch.equal(view.picture(), coloured)
 
 
+def test_a_tint_of_all_reads_no_harmonics(rng, pinhole, scene) -> None:
+    tint = random_tint(rng)
+    tint[:, 3] = 255
+    with splat.prepare(scene, pinhole, backend="cpu") as view:
+        expected = view.picture(tint)
+    with splat.prepare(scene, pinhole, backend="cpu") as view:
+        scene.sh.fill_(float("nan"))
+        assert torch.equal(view.picture(tint), expected)
+
+
 def test_another_tint_projects_nothing_anew(rng, pinhole, scene) -> None:
     tints = [random_tint(rng) for _ in range(2)]
     with splat.prepare(scene, pinhole, backend="cpu") as view:
