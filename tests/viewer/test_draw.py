@@ -223,7 +223,7 @@ def test_another_tint_of_the_same_camera_projects_nothing(drawer, objects, monke
     drawer.id_map(camera(), np.zeros(COUNT, np.int32))
     drawer.depth(camera(), 48.0, 32.0)
     assert len(made) == 1
-    lenses = [{"fx": 81.0}, {"fy": 81.0}, {"cx": 47.0}, {"cy": 33.0}]
+    lenses = [{"fx": 81.0}, {"fx": 81.0, "fy": 81.0}, {"cx": 47.0}, {"cx": 47.0, "cy": 33.0}]
     lenses += [{"model": "opencv"}, {"model": "opencv", "distortion": (0.1,)}]
     others = [replace(camera(), **lens) for lens in lenses]
     for other in (camera(right=0.1), camera(95, 64), camera(96, 65), *others, camera()):
