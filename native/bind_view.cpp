@@ -108,6 +108,14 @@ struct BoundView {
     view.forward_colour(channels, to, record);
   }
 
+  void picture(const std::optional<Array<const uint8_t>>& tint, const Array<uint8_t>& image) {
+    require(prepared && static_cast<int64_t>(image.size()) == pixels() * 3, "image");
+    require(!tint || static_cast<int64_t>(tint->size()) == gaussians * 4, "tint");
+    const uint8_t* tints = tint ? tint->data() : nullptr;
+    nb::gil_scoped_release release;
+    view.picture(tints, image.data());
+  }
+
   // `signal` is padded to a multiple of 16 columns; the image keeps its own.
   void forward_features(const In& signal, int image_channels, const Out& image, const Out& alpha,
                         const Out& depth, const Out& median, bool record) {
@@ -226,6 +234,7 @@ void register_view(nb::module_& m) {
       .def("prepare", &BoundView::prepare)
       .def("recolour", &BoundView::recolour)
       .def("forward_colour", &BoundView::forward_colour)
+      .def("picture", &BoundView::picture, nb::arg().none(), nb::arg())
       .def("forward_features", &BoundView::forward_features)
       .def("adjoint", &BoundView::adjoint)
       .def("backward_colour", &BoundView::backward_colour, nb::arg(), nb::arg(), nb::arg(), nb::arg(),

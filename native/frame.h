@@ -132,6 +132,12 @@ struct Kernels {
                             float* alpha, float* depth, float* median, uint8_t* record,
                             int64_t* evaluated);
 
+  // Colours of one tile in eight bits (height x width x 3), `tint` (red, green, blue and how much
+  // of it; null for none) mixed into each Gaussian's. A block ends where its transmittance is
+  // `enough` or less.
+  void (*picture)(const Frame&, int tile, void* scratch, const uint8_t* tint, float enough,
+                  uint8_t* image);
+
   // D channels (a multiple of 16) of one tile; `block_image` is 256 * D floats of scratch.
   int64_t (*forward_features)(const Frame&, int tile, void* scratch, const float* signal,
                               int channels, int64_t stride, float* block_image, float* image,

@@ -83,16 +83,4 @@ inline void sh_slope(Real x, Real y, Real z, int degree, const Real* weight, Rea
   slope[0] = gx, slope[1] = gy, slope[2] = gz;
 }
 
-// Colour before the clamp at 0.
-inline void sh_colour(const float* sh, int degree, const float* mean, const float* centre,
-                      float* colour) {
-  float x = mean[0] - centre[0], y = mean[1] - centre[1], z = mean[2] - centre[2];
-  float inverse = 1.0f / __builtin_sqrtf(x * x + y * y + z * z);
-  float basis[16];
-  int count = sh_basis(x * inverse, y * inverse, z * inverse, degree, basis);
-  colour[0] = colour[1] = colour[2] = 0.5f;
-  for (int k = 0; k < count; ++k)
-    for (int c = 0; c < 3; ++c) colour[c] += basis[k] * sh[3 * k + c];
-}
-
 }  // namespace splatseg::SPLATSEG_ISA

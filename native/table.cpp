@@ -14,6 +14,7 @@ SPLATSEG_KERNEL(project)
 SPLATSEG_KERNEL(recolour)
 SPLATSEG_KERNEL(find_tiles)
 SPLATSEG_KERNEL(forward_colour)
+SPLATSEG_KERNEL(picture)
 SPLATSEG_KERNEL(forward_features)
 SPLATSEG_KERNEL(adjoint)
 SPLATSEG_KERNEL(backward_colour)
@@ -40,7 +41,7 @@ SPLATSEG_KERNEL(row_products)
 
 const Kernels& table() {
   static const Kernels kernels = {SPLATSEG_TEXT(SPLATSEG_ISA), project, recolour, find_tiles, forward_colour,
-                                  forward_features, adjoint, backward_colour, backward_features,
+                                  picture, forward_features, adjoint, backward_colour, backward_features,
                                   chain, block_weights, block_sums, blocks_forward, blocks_adjoint,
                                   tile_weights, gather_rows, scatter_rows, ids_below,
                                   sparse_adjoint, argmax, nearest_points, count_points,

@@ -37,19 +37,18 @@ inline void start_tile(const Frame& frame, int index, Tile& tile) {
   }
 }
 
-// Loads a chunk and lists for every live block the Gaussians whose ellipse alpha >= kAlphaMin
-// touches it. The test is exact: the least value of a convex quadratic form over a rectangle
+// Which blocks the ellipse alpha >= kAlphaMin of a Gaussian touches, a bit each. The test is exact: the least value of a convex quadratic form over a rectangle
 // lies on one of the two axes through the rectangle's point nearest to the mean, where the
 // other coordinate is clamped to the rectangle. One lane is one block.
-inline void load_chunk(const Frame& frame, Tile& tile, const uint32_t* list, int count) {
-  for (int b = 0; b < 16; ++b) tile.count[b] = 0;
-  const Vec left0 = fma(set(4.0f), load(kLaneX), set(tile.x + 0.5f));
-  const Vec top0 = fma(set(4.0f), load(kLaneY), set(tile.y + 0.5f));
-  const Vec zero = set(0.0f), three = set(3.0f);
-  const uint32_t alive = tile.alive;
-  for (int k = 0; k < count; ++k) {
-    if (k + 8 < count) __builtin_prefetch(&frame.splats[list[k + 8]]);
-    const Splat& s = tile.splats[k] = frame.splats[list[k]];
+struct Touching {
+  Vec left0, top0;
+
+  explicit Touching(const Tile& tile)
+      : left0(fma(set(4.0f), load(kLaneX), set(tile.x + 0.5f))),
+        top0(fma(set(4.0f), load(kLaneY), set(tile.y + 0.5f))) {}
+
+  uint32_t operator()(const Splat& s) const {
+    const Vec zero = set(0.0f), three = set(3.0f);
     Vec left = left0 - set(s.x), right = left + three, top = top0 - set(s.y), bottom = top + three;
     Vec dx = min(max(zero, left), right), dy = min(max(zero, top), bottom);
     Vec a = set(s.a), b = set(s.b), c = set(s.c);
@@ -57,12 +56,67 @@ inline void load_chunk(const Frame& frame, Tile& tile, const uint32_t* list, int
     Vec x = min(max(set(s.slope_x) * dy, left), right);
     Vec along_y = fma(dx, fma(a, dx, b * y), c * y * y);
     Vec along_x = fma(x, fma(a, x, b * dy), c * dy * dy);
-    uint32_t hit = bits(le(min(along_y, along_x), set(s.cut))) & alive;
-    while (hit) {
-      int block = __builtin_ctz(hit);
-      hit &= hit - 1;
-      tile.list[block][tile.count[block]++] = static_cast<uint8_t>(k);
-    }
+    return bits(le(min(along_y, along_x), set(s.cut)));
+  }
+};
+
+// Transposes 8 x 8 bits (Hacker's Delight, 7-3): bit i of byte k becomes bit k of byte i.
+inline uint64_t transposed(uint64_t x) {
+  uint64_t t = (x ^ x >> 7) & 0x00aa00aa00aa00aaull;
+  x ^= t ^ t << 7;
+  t = (x ^ x >> 14) & 0x0000cccc0000ccccull;
+  x ^= t ^ t << 14;
+  t = (x ^ x >> 28) & 0x00000000f0f0f0f0ull;
+  return x ^ t ^ t << 28;
+}
+
+// For each block the Gaussians of a chunk that touch it, a bit each.
+struct Masks {
+  static constexpr int kWords = kChunk / 64;
+  uint64_t words[16][kWords];
+
+  // `hits` has the blocks of each Gaussian in two bytes, low blocks first.
+  explicit Masks(const uint8_t (*hits)[kChunk]) {
+    for (int word = 0; word < kWords; ++word)
+      for (int half = 0; half < 2; ++half) {
+        uint64_t blocks[8] = {};
+        for (int eight = 0; eight < 8; ++eight) {
+          uint64_t x = 0;
+          for (int k = 0; k < 8; ++k)
+            x |= static_cast<uint64_t>(hits[half][word * 64 + eight * 8 + k]) << (8 * k);
+          x = transposed(x);
+          for (int b = 0; b < 8; ++b) blocks[b] |= (x >> (8 * b) & 0xff) << (8 * eight);
+        }
+        for (int b = 0; b < 8; ++b) words[8 * half + b][word] = blocks[b];
+      }
+  }
+};
+
+// Loads the Gaussians of a chunk and finds out which blocks each touches.
+inline Masks load_splats(const Frame& frame, Tile& tile, const uint32_t* list, int count) {
+  const Touching touching(tile);
+  uint8_t hits[2][kChunk];
+  for (int k = 0; k < count; ++k) {
+    if (k + 8 < count) __builtin_prefetch(&frame.splats[list[k + 8]]);
+    const uint32_t hit = touching(tile.splats[k] = frame.splats[list[k]]);
+    hits[0][k] = static_cast<uint8_t>(hit);
+    hits[1][k] = static_cast<uint8_t>(hit >> 8);
+  }
+  for (int half = 0; half < 2; ++half)
+    std::memset(hits[half] + count, 0, static_cast<size_t>(kChunk - count));
+  return Masks(hits);
+}
+
+// The same with the Gaussians of each live block in a list.
+inline void load_chunk(const Frame& frame, Tile& tile, const uint32_t* list, int count) {
+  const Masks masks = load_splats(frame, tile, list, count);
+  for (int b = 0; b < 16; ++b) {
+    int listed = 0;
+    if (tile.alive >> b & 1)
+      for (int word = 0; word < Masks::kWords; ++word)
+        for (uint64_t mask = masks.words[b][word]; mask; mask &= mask - 1)
+          tile.list[b][listed++] = static_cast<uint8_t>(word * 64 + __builtin_ctzll(mask));
+    tile.count[b] = listed;
   }
 }
 

@@ -1,6 +1,7 @@
 #include "view.h"
 
 #include <algorithm>
+#include <cmath>
 #include <cstring>
 
 #include "pool.h"
@@ -10,7 +11,8 @@ namespace {
 
 constexpr int64_t kBatchBytes = 1 << 22;  // partial sums of a batch of tiles, for each thread
 constexpr int64_t kTileScratchFloats = kTileScratchBytes / 4;
-constexpr int kDigit = 11, kBuckets = 1 << kDigit, kPasses = 3;
+constexpr float kUnseen = 0.45f / 255.0f;
+constexpr int kMaxDigit = 14;  // bits of a key that one pass of the sort looks at
 
 int64_t split(int64_t count, int part, int parts) { return count * part / parts; }
 
@@ -61,42 +63,67 @@ void View::prepare(const Cloud& cloud, const Pinhole& camera, const Blending& bl
   });
   sort_by_depth();
   bin();
+  brightest_ = -1;
 }
 
 void View::recolour(const Cloud& cloud, int32_t sh_degree) {
   blending_.sh_degree = sh_degree;
+  brightest_ = -1;
   parallel_for(visible_, 4096, [&](int64_t begin, int64_t end) {
     kernels().recolour(cloud, camera_, blending_, splats_.data(), begin, end);
   });
 }
 
-// Least significant digit first. Depths are positive, so their bits order as they do.
+// Least significant digit first. Depths are positive, so their bits order as they do; above the
+// least depth's they are few, and two passes do mostly.
 void View::sort_by_depth() {
   const int parts = visible_ > (1 << 15) ? threads() : 1;
-  std::vector<uint32_t> counts(static_cast<size_t>(parts) * kBuckets);
   uint64_t *from = keys_.data(), *to = keys_other_.data();
-  for (int pass = 0; pass < kPasses; ++pass) {
-    const int shift = 32 + kDigit * pass;
+  std::vector<uint32_t> lows(static_cast<size_t>(parts), ~0u), highs(static_cast<size_t>(parts), 0u);
+  run_on_threads(parts, [&](int part) {
+    uint32_t low = ~0u, high = 0;
+    const int64_t end = split(visible_, part + 1, parts);
+    for (int64_t i = split(visible_, part, parts); i < end; ++i) {
+      const uint32_t depth = static_cast<uint32_t>(from[i] >> 32);
+      low = std::min(low, depth);
+      high = std::max(high, depth);
+    }
+    lows[static_cast<size_t>(part)] = low;
+    highs[static_cast<size_t>(part)] = high;
+  });
+  const uint32_t low = *std::min_element(lows.begin(), lows.end());
+  const uint32_t high = *std::max_element(highs.begin(), highs.end());
+  int width = 0;  // bits of the largest depth above the least
+  while (width < 32 && low < high && (high - low) >> width) ++width;
+  const int passes = (width + kMaxDigit - 1) / kMaxDigit;
+  const int digit = passes ? (width + passes - 1) / passes : 0, buckets = 1 << digit;
+  std::vector<uint32_t> counts(static_cast<size_t>(parts) * static_cast<size_t>(buckets));
+  for (int pass = 0; pass < passes; ++pass) {
+    const int shift = digit * pass;
+    const uint32_t mask = static_cast<uint32_t>(buckets - 1);
+    auto bucket_of = [=](uint64_t key) {
+      return (static_cast<uint32_t>(key >> 32) - low) >> shift & mask;
+    };
     std::fill(counts.begin(), counts.end(), 0u);
     run_on_threads(parts, [&](int part) {
-      uint32_t* count = counts.data() + static_cast<size_t>(part) * kBuckets;
+      uint32_t* count = counts.data() + static_cast<size_t>(part) * static_cast<size_t>(buckets);
       const int64_t end = split(visible_, part + 1, parts);
-      for (int64_t i = split(visible_, part, parts); i < end; ++i)
-        ++count[(from[i] >> shift) & (kBuckets - 1)];
+      for (int64_t i = split(visible_, part, parts); i < end; ++i) ++count[bucket_of(from[i])];
     });
     uint32_t total = 0;
-    for (int bucket = 0; bucket < kBuckets; ++bucket)
+    for (int bucket = 0; bucket < buckets; ++bucket)
       for (int part = 0; part < parts; ++part) {
-        uint32_t& count = counts[static_cast<size_t>(part) * kBuckets + static_cast<size_t>(bucket)];
+        uint32_t& count = counts[static_cast<size_t>(part) * static_cast<size_t>(buckets) +
+                                 static_cast<size_t>(bucket)];
         uint32_t n = count;
         count = total;
         total += n;
       }
     run_on_threads(parts, [&](int part) {
-      uint32_t* place = counts.data() + static_cast<size_t>(part) * kBuckets;
+      uint32_t* place = counts.data() + static_cast<size_t>(part) * static_cast<size_t>(buckets);
       const int64_t end = split(visible_, part + 1, parts);
       for (int64_t i = split(visible_, part, parts); i < end; ++i)
-        to[place[(from[i] >> shift) & (kBuckets - 1)]++] = from[i];
+        to[place[bucket_of(from[i])]++] = from[i];
     });
     std::swap(from, to);
   }
@@ -188,6 +215,33 @@ void View::forward_tiles(bool record, int64_t scratch_floats, const Work& work) 
   });
   evaluated_ = 0;
   for (int64_t n : evaluated) evaluated_ += n;
+}
+
+float View::brightest() {
+  if (brightest_ >= 0) return brightest_;
+  const int parts = threads();
+  std::vector<float> found(static_cast<size_t>(parts), 0.0f);
+  run_on_threads(parts, [&](int part) {
+    float most = 0;
+    const int64_t end = split(visible_, part + 1, parts);
+    for (int64_t i = split(visible_, part, parts); i < end; ++i) {
+      const Splat& s = splats_[i];
+      most = std::max({most, std::fabs(s.red), std::fabs(s.green), std::fabs(s.blue)});
+    }
+    found[static_cast<size_t>(part)] = most;
+  });
+  return brightest_ = *std::max_element(found.begin(), found.end());
+}
+
+void View::picture(const uint8_t* tint, uint8_t* image) {
+  // What a transmittance T hides is at most T times the largest colour: less than half a level.
+  const float enough = kUnseen / std::max(1.0f, brightest());
+  if (scratch_.size() < static_cast<size_t>(threads())) scratch_.resize(static_cast<size_t>(threads()));
+  parallel_for_thread(tiles(), 4, [&](int thread, int64_t begin, int64_t end) {
+    void* scratch = scratch_[static_cast<size_t>(thread)].resize(kTileScratchFloats);
+    for (int64_t tile = begin; tile < end; ++tile)
+      kernels().picture(frame_, static_cast<int>(tile), scratch, tint, enough, image);
+  });
 }
 
 void View::forward_colour(int channels, const Planes& out, bool record) {

@@ -40,6 +40,9 @@ class View {
   const Frame& frame() const { return frame_; }
   int tiles() const { return frame_.tiles_x * frame_.tiles_y; }
 
+  // Eight bits a channel, at most one level off `forward_colour`; `tint` (n x 4) or null.
+  void picture(const uint8_t* tint, uint8_t* image);
+
   void forward_colour(int channels, const Planes& out, bool record);
   // `signal` has rows of `stride` floats, `channels` of them used, a multiple of 16.
   void forward_features(const float* signal, int channels, int64_t stride, int image_channels,
@@ -61,6 +64,7 @@ class View {
 
  private:
   void sort_by_depth();
+  float brightest();
   void bin();
   uint8_t* record_of(int tile);
   template <class Work>
@@ -71,6 +75,7 @@ class View {
   Pinhole camera_{};
   Blending blending_{};
   int64_t visible_ = 0, evaluated_ = 0;
+  float brightest_ = -1;  // largest part of a colour in view; below 0 where it is not known
   Buffer<Splat> unsorted_, splats_;
   Buffer<uint64_t> keys_, keys_other_;
   Buffer<uint32_t> tile_list_;

@@ -122,7 +122,9 @@ def test_every_requirement_has_one_minimum_that_scripts_oldest_installs() -> Non
     names = [normal(pin) for pin in pins]
     assert len(names) == len(set(names)), "two minimums of one package"
     assert all("==" in pin for pin in pins), pins
-    assert set(names) == listed("sfm", "video", "las", "mesh", "waymo", "models", "dev") - {
+    assert set(names) == listed(
+        "sfm", "video", "las", "mesh", "waymo", "viewer", "models", "dev"
+    ) - {
         "torch",
         "ruff",
         "pyright",

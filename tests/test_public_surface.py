@@ -87,6 +87,7 @@ SURFACE = {
     "sharpen_scene",
     "street_field",
     "uplift",
+    "view",
     "weights",
     "write_capture",
     "write_splats",
@@ -112,6 +113,7 @@ PACKAGES = {
     "street",
     "synthetic",
     "tasks",
+    "viewer",
 }
 
 

@@ -17,6 +17,7 @@ from . import selection as selection
 from . import street as street
 from . import synthetic as synthetic
 from . import tasks as tasks
+from . import viewer as viewer
 from .core import Camera as Camera
 from .core import Capture as Capture
 from .core import FeatureMap as FeatureMap
@@ -96,3 +97,4 @@ from .tasks import segment as segment
 from .tasks import select as select
 from .tasks import sharpen_scene as sharpen_scene
 from .tasks import street_field as street_field
+from .viewer import view as view

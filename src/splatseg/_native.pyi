@@ -63,6 +63,7 @@ class View:
         record: bool,
         /,
     ) -> None: ...
+    def picture(self, tint: Tensor | None, image: Tensor, /) -> None: ...
     def forward_features(
         self,
         signal: Tensor,

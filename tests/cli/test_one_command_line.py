@@ -18,7 +18,7 @@ from splatseg.io.scene import load_scene_layer
 CLI = Path(cli.__file__).parent
 MAKE = {
     "attach", "demo", "edit", "evaluate", "export", "fit", "import", "query", "render",
-    "see", "segment", "select", "sharpen", "street",
+    "see", "segment", "select", "sharpen", "street", "view",
 }  # fmt: skip
 TELL = {"doctor", "info"}
 OWN_HELP = {"frames": ["fit"], "seed": ["demo"]}

@@ -23,6 +23,7 @@ LINES = {
     "street": "street SCENE --evidence labels_semantic --iterations 2",
     "select": "select SCENE --view train_0 --point 8,15 --layer picked",
     "query": "query SCENE chair --layer picked",
+    "view": "view SCENE --no-open",
     "render": "render SCENE --split all -o HERE/made",
     "evaluate": "evaluate SCENE --layer classes --truth CAPTURE/semantic --json-file HERE/a.json",
     "bench": "bench cosseg-replica-semantic --data CAPTURE -o HERE/made",

@@ -93,6 +93,9 @@ COMMANDS: dict[str, CommandEntry] = {
     "query": CommandEntry(
         "splatseg.cli.query", "words -> the objects that answer, with probabilities"
     ),
+    "view": CommandEntry(
+        "splatseg.cli.view", "a scene in the browser: look, click, name objects, export them"
+    ),
     "render": CommandEntry(
         "splatseg.cli.render", "pictures, depth and label maps of a scene's views"
     ),

@@ -6,6 +6,7 @@ photographs and from any other differentiable loss.
 
 from splatseg.core.checkpoints import Checkpoints as Checkpoints
 from splatseg.fit._checkpoint import CheckpointSummary as CheckpointSummary
+from splatseg.fit._checkpoint import checkpoint_gaussians as checkpoint_gaussians
 from splatseg.fit._checkpoint import checkpoint_summary as checkpoint_summary
 from splatseg.fit._options import FitOptions as FitOptions
 from splatseg.fit._options import Preset as Preset

@@ -16,7 +16,7 @@ from typing import Any, Protocol, cast
 import torch
 from torch import Tensor
 
-from splatseg.core import Capture, View
+from splatseg.core import Capture, Gaussians, View
 from splatseg.core.boundary import boundary
 from splatseg.core.checkpoints import (
     DIFFERENCES,
@@ -28,7 +28,7 @@ from splatseg.core.checkpoints import (
 from splatseg.core.options import removed_options
 from splatseg.errors import FileFormatError, InputError, brief
 from splatseg.fit._options import FitOptions
-from splatseg.fit._parameters import Parameters
+from splatseg.fit._parameters import Parameters, final_gaussians
 from splatseg.io.arrays import write_checkpoint_file
 from splatseg.io.checkpoint_files import read_checkpoint_file
 from splatseg.io.digests import camera_numbers, digest, file_mark
@@ -119,7 +119,6 @@ def read_checkpoint(path: Path) -> FitState:
 
     Raises:
         MissingFileError: If there is no such file.
-        CheckpointVersionError: If it is of another version.
         FileFormatError: If it is not a checkpoint, or damaged.
     """
     return _read(path)
@@ -158,7 +157,6 @@ def checkpoint_summary(path: Path) -> CheckpointSummary:
 
     Raises:
         MissingFileError: If there is no such file.
-        CheckpointVersionError: If it is of another version.
         FileFormatError: If it is not a checkpoint, or damaged.
     """
     state = _read(path, names=())
@@ -168,6 +166,18 @@ def checkpoint_summary(path: Path) -> CheckpointSummary:
         seconds=state.number("seconds"),
         gaussians=int(state.number("gaussians")),
     )
+
+
+@boundary
+def checkpoint_gaussians(path: Path) -> Gaussians:
+    """The Gaussians of a fit as they were when its checkpoint was written.
+
+    Raises:
+        MissingFileError: If there is no such file.
+        FileFormatError: If it is not a checkpoint, or damaged.
+    """
+    state = read_checkpoint(path)
+    return final_gaussians(parameters_of(state, "parameters", torch.device("cpu")))
 
 
 # Identity of a fit: its data, options and renderer. A checkpoint resumes only the same fit.

@@ -16,7 +16,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, Int32, Int64
+from jaxtyping import Float, Int, Int32, Int64, UInt8
 from torch import Tensor
 
 from splatseg._check import check_choice, check_finite, check_shape
@@ -71,6 +71,20 @@ class BackendView(ABC):
             screen_offsets: Zeros, added to the projected centres, pixels: a leaf whose gradient
                 is that of the projected centres (gsplat's ``means2d``), which densification
                 needs.
+        """
+
+    @abstractmethod
+    def picture(
+        self,
+        *,
+        tint: UInt8[Tensor, "n 4"] | None = None,
+        signal: Float[Tensor, "n channels"] | None = None,
+    ) -> UInt8[Tensor, "height width 3"]:
+        """`render` in eight bits, a tint mixed into the colours. On the CPU, without a gradient.
+
+        Args:
+            tint: Red, green, blue and how much of them; None is none.
+            signal: Grey (one channel) or colour; None is the colour of the SH.
         """
 
     @abstractmethod

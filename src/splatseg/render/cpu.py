@@ -8,7 +8,7 @@ from typing import Any, ClassVar, cast
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, Int32
+from jaxtyping import Float, Int, Int32, UInt8
 from torch import Tensor
 
 from splatseg import _native
@@ -60,6 +60,7 @@ class CpuView(BackendView):
         self._closed = False
         self._forward: tuple[Tensor, Tensor, Tensor] | None = None
         self._wide: Tensor | None = None
+        self._has_harmonics = False
 
     def close(self) -> None:
         """Give the scratch memory back."""
@@ -140,6 +141,28 @@ class CpuView(BackendView):
         kept = (image.detach(), alpha.detach(), depth_sum.detach())
         self._forward = kept if record else None
         return image, alpha, depth_sum, median
+
+    @torch.no_grad()
+    def picture(
+        self,
+        *,
+        tint: UInt8[Tensor, "n 4"] | None = None,
+        signal: Float[Tensor, "n channels"] | None = None,
+    ) -> UInt8[Tensor, "height width 3"]:
+        """`render` in eight bits, at most one level off, a tint mixed into the colours.
+
+        A new tint costs no projection and no harmonics; where it covers all of every colour,
+        there are no harmonics at all.
+        """
+        image = torch.empty(*self.size, 3, dtype=torch.uint8)
+        if tint is not None and bool((tint[:, 3] == 255).all()):
+            view = self._kernels()
+        elif signal is None:
+            view = self._kernels(self._gaussians.sh)
+        else:
+            view = self._kernels(None, signal.expand(-1, 3))
+        view.picture(None if tint is None else tint.contiguous(), image)
+        return image
 
     def back_project(self, image: Float[Tensor, "height width channels"]) -> BackProjected:
         """``W.T @ image`` and ``W.T @ 1``. No gradient."""
@@ -225,13 +248,15 @@ class CpuView(BackendView):
     def _kernels(self, sh: Tensor | None = None, signal: Tensor | None = None) -> _native.View:
         """The projected view, with these colours where some are given.
 
-        Colours are stored with the projected Gaussians. What is recorded for `backward` has those
+        Colours are stored with the projected Gaussians, and those of the harmonics stay until a
+        signal takes their place. What is recorded for `backward` has those
         of its own render.
         """
         if self._closed:
             raise InputError("view: expected one that is open, this one was closed.")
-        if self._view is not None and sh is None and signal is None:
+        if self._view is not None and signal is None and (sh is None or self._has_harmonics):
             return self._view
+        self._has_harmonics = sh is not None
         scene, camera, options = self._gaussians, self._camera, self._options
         if self._view is None:
             self._geometry = (

@@ -8,13 +8,14 @@ from types import ModuleType
 from typing import Any, ClassVar
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from splatseg.core import Camera, Gaussians
 from splatseg.core.sh import evaluate_sh
 from splatseg.errors import BackendError, InputError, MissingPackageError
 from splatseg.render._backend import Backend, BackendView, needs_graph
+from splatseg.render._picture import eight_bits, mixed_colours
 from splatseg.render._rows import SparseWeights
 from splatseg.render._values import (
     ALPHA_MIN,
@@ -312,6 +313,23 @@ class CudaBackendView(BackendView):
             depth=depth.to(device=home, dtype=dtype),
             median_depth=median.to(device=home, dtype=dtype),
         )
+
+    @torch.no_grad()
+    def picture(
+        self,
+        *,
+        tint: UInt8[Tensor, "n 4"] | None = None,
+        signal: Float[Tensor, "n channels"] | None = None,
+    ) -> UInt8[Tensor, "height width 3"]:
+        """`render` in eight bits, a tint mixed into the colours. On the CPU."""
+        colours = mixed_colours(
+            self._gaussians,
+            self._camera,
+            tint=tint,
+            signal=signal,
+            degree=self._options.sh_degree,
+        )
+        return eight_bits(self.render(colours).image)
 
     @torch.no_grad()
     def back_project(self, image: Float[Tensor, "height width channels"]) -> BackProjected:

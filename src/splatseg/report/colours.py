@@ -12,29 +12,18 @@ from scipy import ndimage, sparse
 from torch import Tensor
 
 from splatseg.core import UNLABELLED, ClassInfo, ClassTable, Gaussians, Labels, RenderableLayer
-
-Colour = tuple[int, int, int]
-
-NOTHING: Colour = (24, 24, 28)
-"""Where there is no id, or nothing at all."""
+from splatseg.report.palette import NOTHING as NOTHING
+from splatseg.report.palette import Colour as Colour
+from splatseg.report.palette import own_colour
 
 
 def colour_of(id: int, classes: ClassTable | None = None) -> Colour:
-    """The class table's colour of an id, else a colour of its own; -1 is nearly black.
-
-    Colours that are made up walk round the hues by the golden ratio, and through brightness by
-    another irrational step, so that no two of the first forty look alike.
-    """
-    if id < 0:
-        return NOTHING
-    if classes is not None:
+    """The class table's colour of an id, else a colour of its own; -1 is nearly black."""
+    if id >= 0 and classes is not None:
         for row in classes.rows:
             if row.id == id and row.colour is not None:
                 return row.colour
-    hue = (id * 0.6180339887) % 1.0
-    light = 0.40 + 0.38 * ((id * 0.7548776662) % 1.0)
-    red, green, blue = colorsys.hls_to_rgb(hue, light, 0.62)
-    return round(255 * red), round(255 * green), round(255 * blue)
+    return own_colour(id)
 
 
 def colour_labels(

@@ -1,7 +1,7 @@
 """Prompts become a selection: once, or again and again in a session."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Self
 
@@ -96,6 +96,7 @@ class SelectionSession:
             first prompt needs it.
         prompter: Turns points and boxes into masks of their views, such as SAM; None leaves them.
         layers: Layers at hand; others are read from the scene's folder.
+        neighbours: Neighbours of the scene's Gaussians, to share; None finds them when needed.
         backend: Rendering backend.
         observer: Is told of what is opened.
     """
@@ -109,6 +110,7 @@ class SelectionSession:
         source: MembershipSource | None = None,
         prompter: PromptableMasks | None = None,
         layers: Mapping[str, Layer] | None = None,
+        neighbours: SceneIndex | None = None,
         backend: BackendName = "auto",
         observer: Observer = SILENT,
     ) -> None:
@@ -117,7 +119,7 @@ class SelectionSession:
         self._options.level  # noqa: B018  (an error before anything is opened)
         self._prompter = prompter
         self._views = ViewCache(scene.gaussians, backend=backend)
-        self._neighbours = SceneIndex(scene.gaussians)
+        self._neighbours = neighbours or SceneIndex(scene.gaussians)
         self._opened = (
             None if source is None else OpenedSource(source=source, name=type(source).__name__)
         )
@@ -158,6 +160,7 @@ class SelectionSession:
         base: Selection | None = None,
         options: SelectOptions | None = None,
         advise: bool = False,
+        draft: Callable[[Float[Tensor, "n"]], None] | None = None,
     ) -> Selected:
         """See `splatseg.tasks.select`.
 
@@ -166,6 +169,8 @@ class SelectionSession:
             base: A selection that this one adds to, is subtracted from or intersected with.
             options: Instead of the session's; they may not ask for another source.
             advise: Whether to look for where the next click would help most.
+            draft: Is called with what the source says, before it is cleaned and combined with the
+                base: confidences in [0, 1], above 0.5 for what is selected.
 
         Raises:
             InputError: If the options ask for another source than the session has.
@@ -188,6 +193,8 @@ class SelectionSession:
             seconds["open"] = time.perf_counter() - began
         context = self._seen(shown, options, seconds)
         confidence = self._membership(context, similar, seconds)
+        if draft is not None:
+            draft(within(confidence, solids, self._work.gaussians))
         if shown or similar:
             confidence, steps = postprocess(confidence, context, enabled=self._steps(options))
             seconds |= steps
@@ -326,6 +333,7 @@ def open_selector(
     source: MembershipSource | None = None,
     prompter: PromptableMasks | None = None,
     layers: Mapping[str, Layer] | None = None,
+    neighbours: SceneIndex | None = None,
     backend: BackendName = "auto",
     observer: Observer = SILENT,
 ) -> SelectionSession:
@@ -342,6 +350,7 @@ def open_selector(
         source=source,
         prompter=prompter,
         layers=layers,
+        neighbours=neighbours,
         backend=backend,
         observer=observer,
     )

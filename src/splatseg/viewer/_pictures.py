@@ -1,0 +1,139 @@
+"""Pictures of a session's document: what is shown of it, and in which colours."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatseg.core import Camera
+from splatseg.viewer import _messages as messages
+from splatseg.viewer._document import MEMBER, Confidence, Document
+from splatseg.viewer._draw import Drawer, Picture
+from splatseg.viewer._session import Session
+
+_MAX_OBJECT = 32766
+_FIRST_SUGGESTION = 32768
+_FIRST_THING = 49152
+"""From here on an id of an id map is a thing that a click would select: it has an outline alone."""
+
+
+class Pictures:
+    """Draws a session's document as it is now.
+
+    Args:
+        session: The session.
+        drawer: Draws its scene.
+    """
+
+    def __init__(self, session: Session, drawer: Drawer) -> None:
+        self._session = session
+        self._drawer = drawer
+        self._kept: _Look | None = None
+
+    @property
+    def selection(self) -> Confidence | None:
+        """The confidences of what is selected; None where nothing is."""
+        mask = self._session.document.selection
+        return None if mask is None else self._session.confidence(mask)
+
+    def picture(
+        self,
+        request: messages.DrawRequest | messages.Still,
+        camera: Camera,
+        *,
+        selection: Confidence | None,
+        words: str = "",
+        scale: float = 1.0,
+    ) -> Picture:
+        """A picture of a camera.
+
+        Args:
+            request: Mode, and the object that is drawn alone.
+            camera: The camera.
+            selection: What is tinted.
+            words: What similarity is to; empty for the selection.
+            scale: Share of the camera's pixels.
+        """
+        wants_objects = request.mode in ("objects", "blend")
+        return self._drawer.picture(
+            camera,
+            mode=request.mode,
+            selection=selection,
+            objects=self._look.objects if wants_objects else (),
+            shown=self._shown(request),
+            similarity=self._similarity(words) if request.mode == "similarity" else None,
+            scale=scale,
+        )
+
+    def id_map(self, request: messages.DrawRequest) -> NDArray[np.uint16]:
+        """The object or suggestion at each pixel, as the protocol has it."""
+        return self._drawer.id_map(request.camera(), self._look.ids, shown=self._shown(request))
+
+    @property
+    def _look(self) -> "_Look":
+        revision = self._session.document.revision
+        if self._kept is None or self._kept.revision != revision:
+            self._kept = _Look(self._session, self._kept)
+        return self._kept
+
+    def _shown(self, request: messages.DrawRequest | messages.Still) -> NDArray[np.bool_]:
+        only = request.only if isinstance(request, messages.DrawRequest) else None
+        if only is None:
+            return self._look.shown
+        return self._session.confidence(self._session.document.object(only).mask) >= MEMBER
+
+    def _similarity(self, words: str) -> NDArray[np.float32] | None:
+        if words:
+            return self._session.similarity(words)
+        selection = self.selection
+        return None if selection is None else np.divide(selection, 255, dtype=np.float32)
+
+
+class _Look:
+    """What pictures of one document are drawn from."""
+
+    def __init__(self, session: Session, before: "_Look | None") -> None:
+        document = session.document
+        self.revision = document.revision
+        self._session = session
+        self._document = document
+        self.shown: NDArray[np.bool_] = session.visible
+        self._owners: NDArray[np.int32] | None = None
+        self._ids: NDArray[np.int32] | None = None
+        self._things: NDArray[np.int32] | None = None
+        if before is not None and before.same_objects(document):
+            self._owners, self._ids, self._things = before._owners, before._ids, before._things
+
+    def same_objects(self, document: Document) -> bool:
+        """Whether a document has the same objects and suggestions."""
+        mine = self._document
+        return mine.objects == document.objects and mine.suggestions == document.suggestions
+
+    @property
+    def owners(self) -> NDArray[np.int32]:
+        """The object of each Gaussian, -1 for none."""
+        if self._owners is None:
+            self._owners = self._session.owners()
+        return self._owners
+
+    @property
+    def objects(self) -> list[tuple[NDArray[np.bool_], tuple[int, int, int]]]:
+        """Which Gaussians each object has, and its colour."""
+        owners = self.owners
+        return [(owners == one.id, one.colour) for one in self._document.objects]
+
+    @property
+    def ids(self) -> NDArray[np.int32]:
+        """The id of each Gaussian in an id map."""
+        things = self._session.things
+        if self._ids is None or self._things is not things:
+            self._things = things
+            owners = self.owners
+            ids = np.where(owners <= _MAX_OBJECT, owners + 1, 0).astype(np.int32)
+            last = np.iinfo(np.uint16).max - _FIRST_THING
+            known = (things >= 0) & (things <= last) & (owners < 0)
+            ids[known] = _FIRST_THING + things[known]
+            for one in self._document.suggestions:
+                if one.id < _FIRST_THING - _FIRST_SUGGESTION:
+                    member = self._session.confidence(one.mask) >= MEMBER
+                    ids[member & (owners < 0)] = _FIRST_SUGGESTION + one.id
+            self._ids = ids
+        return self._ids

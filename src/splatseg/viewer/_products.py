@@ -1,0 +1,316 @@
+"""What is made of a document: labels, an edited scene, and files.
+
+Edits become those of `splatseg.edit`, in their order; labels follow them row by row.
+"""
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from splatseg.core import (
+    UNLABELLED,
+    Edited,
+    Gaussians,
+    InstanceFacts,
+    Labels,
+    LayerInfo,
+    Scene,
+    Selection,
+    Similarity,
+)
+from splatseg.core.rigid import rotation_from_quaternion
+from splatseg.edit import duplicate, recolour, remove, transform
+from splatseg.errors import InputError, quoted
+from splatseg.io.atomic import named_write_failures, path_inside
+from splatseg.io.export.splats import holds_columns
+from splatseg.io.scene import check_name, load_scene_layer, save_scene_layer, scene_layer_names
+from splatseg.io.splats import WritableFormat
+from splatseg.render import BackendName
+from splatseg.tasks import ExportOptions, export_scene
+from splatseg.tasks.work import EXPORTS_FOLDER, Observer, layer_versions
+from splatseg.viewer._journal import command_to_json
+from splatseg.viewer._state import (
+    MEMBER,
+    Command,
+    Confidence,
+    Document,
+    Edit,
+    Masks,
+    Object,
+)
+
+METHOD = "view"
+"""Method of layers that are saved here."""
+
+ExportWhat = Literal["splat", "objects", "points", "coco", "table"]
+
+_LAYER = "objects"
+_SUFFIXES: Mapping[str, str] = {"splat": ".ply", "points": ".ply", "table": ".csv"}
+
+
+class Owners:
+    """Which object each Gaussian belongs to: the surest, of equally sure ones the later.
+
+    What was found is kept, and gone on with where objects were only added.
+
+    Args:
+        gaussians: Gaussians of the scene.
+        masks: The masks of the objects.
+    """
+
+    def __init__(self, gaussians: int, masks: Masks) -> None:
+        self._gaussians = gaussians
+        self._masks = masks
+        self._known: tuple[tuple[int, str], ...] = ()
+        self._ids = np.full(gaussians, UNLABELLED, np.int32)
+        self._sure = np.zeros(gaussians, np.uint8)
+
+    def of(self, objects: Sequence[Object]) -> tuple[NDArray[np.int32], Confidence]:
+        """The id of the object of each Gaussian, -1 for none, and its confidence, 0 to 255."""
+        wanted = tuple((one.id, one.mask.id) for one in objects)
+        done = len(self._known)
+        if wanted[:done] != self._known:
+            done = 0
+            self._ids = np.full(self._gaussians, UNLABELLED, np.int32)
+            self._sure = np.zeros(self._gaussians, np.uint8)
+        if done < len(wanted):
+            ids, sure = self._ids.copy(), self._sure.copy()
+            for one in objects[done:]:
+                confidence = self._masks.get(one.mask)
+                better = (confidence >= MEMBER) & (confidence >= sure)
+                ids[better] = one.id
+                sure[better] = confidence[better]
+            self._ids, self._sure = ids, sure
+        self._known = wanted
+        for array in (self._ids, self._sure):
+            array.flags.writeable = False
+        return self._ids, self._sure
+
+
+def labels_of(
+    document: Document,
+    owners: Owners,
+    scene: Scene,
+    commands: Sequence[Command],
+    *,
+    ids: Sequence[int] | None = None,
+) -> Labels:
+    """The objects as labels of Gaussians, with their names, classes and colours.
+
+    Args:
+        document: Whose objects.
+        owners: Which object each Gaussian belongs to.
+        scene: The scene; its class table gives classes their ids.
+        commands: What made the document, for the record.
+        ids: Only these objects; None takes all.
+
+    Raises:
+        InputError: If there is no object, or none of an id.
+    """
+    chosen = document.objects if ids is None else [document.object(id) for id in ids]
+    if not chosen:
+        raise InputError("objects: expected at least one, got none; keep a selection first.")
+    found, sure = owners.of(document.objects)
+    rows = np.isin(found, [one.id for one in chosen])
+    classes = _class_ids(document, scene)
+    made = [command_to_json(command) for command in commands]
+    return Labels(
+        ids=torch.from_numpy(np.where(rows, found, UNLABELLED)),
+        confidence=torch.from_numpy(np.where(rows, sure, 0)).float() / 255,
+        info=LayerInfo(
+            method=METHOD,
+            names={one.id: one.name for one in chosen},
+            class_of={one.id: classes[one.class_name] for one in chosen if one.class_name},
+            instances={one.id: InstanceFacts(details={"source": one.source}) for one in chosen},
+            versions=layer_versions(),
+            details={
+                "classes": {str(id): name for name, id in classes.items()},
+                "colours": {str(one.id): list(one.colour) for one in chosen},
+                "commands": [{"do": name, "arguments": arguments} for name, arguments in made],
+            },
+        ),
+    )
+
+
+def save(labels: Labels, root: Path, name: str) -> None:
+    """Save labels as a layer of a scene folder.
+
+    Raises:
+        InputError: If a layer of this name is there that was not saved here.
+    """
+    if name in scene_layer_names(root) and load_scene_layer(root, name).info.method != METHOD:
+        raise InputError(
+            f"layer: {quoted(name)} is there already and was not saved here; choose another name."
+        )
+    save_scene_layer(labels, root, name)
+
+
+def shown(document: Document, owners: Owners, masks: Masks) -> NDArray[np.bool_]:
+    """(n,) which Gaussians of the scene are shown.
+
+    Not those that were removed, nor those of hidden objects; where objects are isolated, theirs
+    alone.
+    """
+    ids, _ = owners.of(document.objects)
+    found = ~np.isin(ids, [one.id for one in document.objects if not one.visible])
+    if document.isolated:
+        found &= np.isin(ids, document.isolated)
+    for edit in document.edits:
+        if edit.kind == "remove":
+            found &= masks.get(edit.mask) < MEMBER
+    return found
+
+
+def digest_of(scene: Scene) -> str:
+    """Tells the Gaussians of a scene from those of others: a digest of their centres."""
+    means = scene.gaussians.means.detach().cpu().float().contiguous().numpy()
+    return hashlib.blake2b(means.astype("<f4").tobytes(), digest_size=16).hexdigest()
+
+
+def _class_ids(document: Document, scene: Scene) -> dict[str, int]:
+    """Ids of the classes in use: the scene's, and behind them those that it has not."""
+    rows = () if scene.classes is None else scene.classes.rows
+    known = {row.name: row.id for row in rows if row.id > 0}
+    following = max((row.id for row in rows), default=0)
+    found: dict[str, int] = {}
+    for name in dict.fromkeys(one.class_name for one in document.objects if one.class_name):
+        if name not in known:
+            following = max(following, 0) + 1
+            known[name] = following
+        found[name] = known[name]
+    return found
+
+
+def similarity_of(edit: Edit) -> Similarity:
+    """The movement of an edit: x becomes about + s R (x - about) + t."""
+    rotation = rotation_from_quaternion(torch.tensor(edit.rotation, dtype=torch.float64))
+    about = torch.tensor(edit.about, dtype=torch.float64)
+    translation = torch.tensor(edit.translation, dtype=torch.float64)
+    return Similarity(
+        rotation=rotation,
+        translation=about + translation - edit.scale * (rotation @ about),
+        scale=edit.scale,
+    )
+
+
+def edited(gaussians: Gaussians, edits: Sequence[Edit], masks: Masks) -> Edited:
+    """Gaussians after edits, each of which is of those that were there before the first.
+
+    What was removed is not changed any more; copies stay as they were made.
+    """
+    found = Edited.unchanged(gaussians)
+    copied = torch.zeros(len(gaussians), dtype=torch.bool)
+    for edit in edits:
+        chosen = torch.from_numpy(masks.get(edit.mask) >= MEMBER)[found.rows] & ~copied
+        if not bool(chosen.any()):
+            continue
+        step = _step(found.gaussians, Selection(mask=chosen), edit)
+        copied = copied[step.rows]
+        copied[len(found) :] = True
+        found = found.then(step)
+    return found
+
+
+def _step(gaussians: Gaussians, selection: Selection, edit: Edit) -> Edited:
+    match edit.kind:
+        case "remove":
+            return remove(gaussians, selection)
+        case "duplicate":
+            return duplicate(gaussians, selection, similarity_of(edit))
+        case "move":
+            return transform(gaussians, similarity_of(edit), selection=selection)
+        case "recolour":
+            colour = [value / 255 for value in edit.colour or (0, 0, 0)]
+            return recolour(gaussians, selection, colour=colour)
+
+
+def exports_folder(scene: Scene, folder: Path | None) -> Path:
+    """Where exports go: into the scene, else beside the journal.
+
+    Raises:
+        InputError: If there is neither.
+    """
+    root = scene.root if scene.root is not None else folder
+    if root is None:
+        raise InputError("export: expected a scene with a folder to write to; save it first.")
+    with named_write_failures(root / EXPORTS_FOLDER):
+        return path_inside(root, EXPORTS_FOLDER, "file").parent
+
+
+def export(
+    scene: Scene,
+    labels: Labels | None,
+    folder: Path,
+    *,
+    what: ExportWhat,
+    name: str,
+    format: WritableFormat | None,
+    only: Sequence[int] | None,
+    backend: BackendName,
+    observer: Observer,
+) -> Path:
+    """Write a scene, or objects of it, as files of other programs; gives the file or folder.
+
+    Args:
+        scene: The scene, edited.
+        labels: Its objects; None where there are none.
+        folder: Where to write to.
+        what: See `splatseg.export_scene`.
+        name: Of the file; its ending says the format.
+        format: Of splats, where the name does not say it.
+        only: Ids of objects that are written alone; None writes everything.
+        backend: Rendering backend.
+        observer: Is told of the progress.
+
+    Raises:
+        InputError: If the name is none, or there is nothing to write.
+    """
+    check_name("export", name)
+    ending = f".{format.rstrip('3')}" if format is not None and what == "splat" else None
+    path = folder / (name if "." in name else name + (ending or _SUFFIXES.get(what, "")))
+    if labels is not None and only is not None and what in ("splat", "points"):
+        rows = torch.isin(labels.ids, torch.tensor(only, dtype=labels.ids.dtype))
+        scene, labels = replace(scene, gaussians=scene.gaussians[rows]), labels[rows]
+    if what == "splat" and not holds_columns(path, format):
+        labels = None
+    made = export_scene(
+        scene,
+        path,
+        what,
+        options=ExportOptions(layer=None if labels is None else _LAYER, splat_format=format),
+        layers={} if labels is None else {_LAYER: labels},
+        backend=backend,
+        observer=observer,
+    )
+    return made.output
+
+
+def edit_records(edits: Sequence[Edit]) -> list[dict[str, Any]]:
+    """Edits as the provenance of an edited scene has them."""
+    return [
+        {
+            "kind": edit.kind,
+            "gaussians": edit.mask.count,
+            "mask": edit.mask.id,
+            "rotation": list(edit.rotation),
+            "translation": list(edit.translation),
+            "scale": edit.scale,
+            "about": list(edit.about),
+            "colour": None if edit.colour is None else list(edit.colour),
+        }
+        for edit in edits
+    ]
+
+
+def edited_scene(scene: Scene, made: Edited, edits: Sequence[Edit]) -> Scene:
+    """A scene with Gaussians after edits; without a folder, as its files are not of these."""
+    if not edits:
+        return scene
+    provenance = dict(scene.provenance) | {"view_edits": edit_records(edits)}
+    return replace(scene, gaussians=made.gaussians, provenance=provenance, root=None)

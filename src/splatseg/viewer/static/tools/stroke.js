@@ -1,0 +1,105 @@
+/** Stroke: paint over a thing with a brush. */
+
+/**
+ * @typedef {import("../main.js").App} App
+ * @typedef {import("../stage/stage.js").Tool} Tool
+ * @typedef {import("../stage/stage.js").Point} Point
+ */
+
+import { clamp } from "../dom.js";
+
+const APART = 3;
+const MOST_POINTS = 1500;
+
+/** @implements {Tool} */
+export class StrokeTool {
+  cursor = "none";
+  says = "Paint over a thing. [ and ] change the brush.";
+
+  /** @param {App} app */
+  constructor(app) {
+    this.app = app;
+    /** Of the brush, CSS pixels. */
+    this.width = 18;
+    /** @type {Point[]} */
+    this.points = [];
+    /** @type {Point|null} */
+    this.at = null;
+  }
+
+  /** @param {number} width */
+  setWidth(width) {
+    this.width = clamp(Math.round(width), 2, 200);
+    this.app.store.changed("tool");
+  }
+
+  /** @param {Point} point @returns {boolean} */
+  down(point) {
+    this.points = [point];
+    this.at = point;
+    return true;
+  }
+
+  /** @param {Point} point */
+  move(point) {
+    this.at = point;
+    const last = this.points.at(-1);
+    if (!last || this.points.length >= MOST_POINTS) return;
+    if (Math.hypot(point.x - last.x, point.y - last.y) >= APART) this.points.push(point);
+  }
+
+  /** @param {Point} point */
+  up(point) {
+    const points = this.points;
+    this.points = [];
+    if (points.length === 0) return;
+    const { gestures } = this.app;
+    const target = gestures.target(points[0]);
+    gestures.begin(
+      {
+        kind: "stroke",
+        points: points.map((at) => target.pixel(at)),
+        width: Math.round(10 * this.width * target.scale) / 10,
+      },
+      { mode: gestures.modeOf(point), view: target.view },
+    );
+  }
+
+  /** @param {Point} point */
+  hover(point) {
+    this.at = point.touch ? null : point;
+    this.app.stage.redraw();
+  }
+
+  /** @returns {boolean} */
+  cancel() {
+    const had = this.points.length > 0;
+    this.points = [];
+    return had;
+  }
+
+  /** @param {CanvasRenderingContext2D} g */
+  draw(g) {
+    if (this.points.length > 0) {
+      const path = new Path2D();
+      path.moveTo(this.points[0].x, this.points[0].y);
+      for (const { x, y } of this.points) path.lineTo(x, y);
+      g.globalAlpha = 0.45;
+      g.strokeStyle = this.app.accent;
+      g.lineWidth = this.width;
+      g.stroke(path);
+      g.globalAlpha = 1;
+    }
+    if (!this.at) return;
+    for (const [colour, width] of /** @type {const} */ ([
+      ["rgb(0 0 0 / .6)", 3],
+      ["#fff", 1.5],
+    ])) {
+      g.beginPath();
+      g.arc(this.at.x, this.at.y, this.width / 2, 0, 7);
+      g.strokeStyle = colour;
+      g.lineWidth = width;
+      g.stroke();
+    }
+  }
+}
