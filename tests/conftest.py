@@ -2,7 +2,7 @@
 
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 
@@ -12,6 +12,7 @@ import torch
 from filelock import FileLock
 from hypothesis import HealthCheck, settings
 
+from splatseg.methods import _method
 from support import shared
 from support.drive import write_drive
 from support.products import reorder_all_products, reordered
@@ -61,6 +62,15 @@ def project_root() -> Path:
 def _draws_begin_anew() -> None:
     """Torch draws the same numbers in a test, whatever ran before it."""
     torch.manual_seed(20240817)
+
+
+@pytest.fixture(autouse=True)
+def _methods_as_before() -> Iterator[None]:
+    """What a test or a notebook registers is a method of its own: pages of help know no other."""
+    before = dict(_method._REGISTERED)
+    yield
+    _method._REGISTERED.clear()
+    _method._REGISTERED.update(before)
 
 
 @pytest.fixture
