@@ -1,6 +1,6 @@
 """Nested masks of the train views as a tree, scored on the test views by the independent scorer.
 
-    python benchmarks/nested.py SCENE ../shared/data/office [--rows tree flat ...] [--work DIR]
+    python benchmarks/nested.py SCENE ../shared/data/office [--rows tree sam ...] [--work DIR]
 
 Rows:
 
@@ -8,8 +8,7 @@ Rows:
   what the cuts hold together of instances and of parts (`score.py tree`), CPU time and memory.
 - `parts`, `objects`: association of the masks of one level alone, which the recorded truth of the
   masks (`../masks_nested_truth`) tells: what a tree must not fall short of.
-- `flat`: association without levels.
-- `sam`: `masks_sam`, whose levels are drawn at random, as a tree and flat.
+- `sam`: `masks_sam`, whose levels are drawn at random, as a tree.
 
 The truth of the masks is looked at for references only. How often each cue of a node's level is
 right says `benchmarks/nested_cues.py`.
@@ -137,36 +136,18 @@ def one_level(level: str, truth: str) -> Callable[[Bench], None]:
     return row
 
 
-def flat(bench: Bench) -> None:
-    """Without levels, at the default agreement and a higher one."""
-    source = EvidenceSegments(evidence=open_evidence(bench.data / "masks_nested"))
-    for agreement in (0.2, 0.6):
-        layer, seconds = bench.made(source, level="object", agreement=agreement)
-        if isinstance(layer, InstanceTree):
-            raise TypeError("expected labels")
-        folder = bench.draw(layer, "flat")
-        line(
-            f"flat, agreement {agreement}", bench.score("instances", [folder], "instance"), seconds
-        )
-
-
 def sam(bench: Bench) -> None:
     """Masks of a level drawn at random."""
     source = EvidenceSegments(evidence=open_evidence(bench.data / "masks_sam"))
     layer, seconds = bench.made(source)
     if isinstance(layer, InstanceTree):
         report_tree(bench, "masks_sam", layer, seconds)
-    layer, seconds = bench.made(source, level="object")
-    if isinstance(layer, Labels):
-        folder = bench.draw(layer, "masks_sam_flat")
-        line("masks_sam, flat", bench.score("instances", [folder], "instance"), seconds)
 
 
 ROWS: dict[str, Callable[[Bench], None]] = {
     "tree": tree,
     "parts": one_level("part", "part"),
     "objects": one_level("object", "instance"),
-    "flat": flat,
     "sam": sam,
 }
 

@@ -290,6 +290,7 @@ def _own_blocks(path: Path) -> tuple[str, ...]:
     if found is None:
         return ()
     names = tuple(str(name) for name in check_array(path, "names of blocks", found, ("n",), "U"))
+    expect(all(name.isprintable() for name in names), path, "names of blocks that can be printed")
     distinct = len(names) == len(set(names)) > 0
     expect(distinct, path, "blocks of different names, got the same twice or none")
     return names

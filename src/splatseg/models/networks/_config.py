@@ -40,7 +40,7 @@ class Numbers:
 _LAYERS = """
     auxiliary_num_convs blocks_per_stage conditional_layer decoder_layers decoder_n_points depths
     encoder_layers encoder_n_points fpn_top_down_levels iou_head_depth memory_attention_num_layers
-    memory_fuser_num_layers num_blocks num_encoder_blocks num_feature_levels num_hidden_layers
+    memory_fuser_num_layers num_blocks num_encoder_blocks num_feature_levels
     num_layers num_maskmem num_multimask_outputs num_point_embeddings num_query_pool_stages
     num_register_tokens num_stages num_upsampling_stages num_upscale_blocks query_dec_layers
     text_encoder_num_layers text_encoder_proj_layers width_factor
@@ -143,6 +143,7 @@ NUMBERS = {
         (_SIZES, Numbers(0, 1 << 20)),
         (_WHOLE, Numbers(-(1 << 20), 1 << 20)),
         (_REAL, Numbers(-1e9, 1e9, whole=False)),
+        ("num_hidden_layers", Numbers(1, 200, sum_at_most=200)),
     )
     for name in names.split()
 }

@@ -116,7 +116,7 @@ def network(
             f"{place.folder}: expected all weights of {class_name}, got none or others for "
             f"{len(lacking)} of its tensors ({', '.join(sorted(lacking)[:_SOME])}{more})."
         )
-    for part in (made, *made.children()):
+    for part in made.modules():
         part.forward = answering(place.folder, part.forward)
     return made.to(place.device).eval()
 
@@ -133,7 +133,9 @@ def answering(folder: Path, forward: Callable[..., Any]) -> Callable[..., Any]:
             return forward(*words, **more)
         except SplatsegError:
             raise
-        except (RuntimeError, ValueError, TypeError, ArithmeticError, LookupError) as error:
+        except (
+            RuntimeError, ValueError, TypeError, ArithmeticError, LookupError, AttributeError,
+        ) as error:  # fmt: skip
             if is_lack_of_memory(error) or "CUDA" in str(error):
                 raise
             raise FileFormatError(

@@ -23,7 +23,7 @@ from splatseg.core import ClassTable, DepthMap, FeatureMap, LabelMap
 from splatseg.core.models import DeepFeatures, Image
 from splatseg.core.options import Count, Positive, options
 from splatseg.core.threads import network_inference
-from splatseg.errors import RangeError
+from splatseg.errors import FileFormatError, RangeError
 from splatseg.models._images import HALVES, InputSize, Normalisation, patch_grid, patch_input
 from splatseg.models._weights import Loading
 from splatseg.models.networks._library import BatchedNetwork, configuration, network, side_of
@@ -104,6 +104,12 @@ class Dino(BatchedNetwork[DeepFeatures]):
         )
         output = self._network(batch, output_hidden_states=True, **self._positions)
         states = cast("Sequence[Tensor]", output.hidden_states)  # the first came in
+        wanted = self._tokens + grid.rows * grid.columns
+        if states[-1].shape[1] != wanted:
+            raise FileFormatError(
+                f"{self._place.folder}: expected a network that gives {wanted} tokens of an image "
+                f"of {grid.rows} x {grid.columns} patches, got {states[-1].shape[1]}."
+            )
         norm = getattr(self._network, "layernorm", None) or self._network.norm
         tokens = [norm(states[block]) for block in self._blocks]
         return [
