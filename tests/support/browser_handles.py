@@ -1,0 +1,1 @@
+TOUCHES: dict[str, tuple[str, ...]] = {}
