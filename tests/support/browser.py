@@ -278,16 +278,19 @@ class Tab:
         mouse.up(button=button)
 
     def click(self, point: Sequence[float], *keys: str, **how: Any) -> dict[str, Any] | None:
-        """Click a thing; the selection that comes of it."""
+        """Click a thing; the selection that comes of it.
 
-        def act() -> None:
-            for key in keys:
-                self.page.keyboard.down(key)
-            self.page.mouse.click(*self.at(point, **how))
-            for key in keys:
-                self.page.keyboard.up(key)
+        Twice at one place would be a double click: `aside` (pixels) is beside it.
+        """
+        return self.selecting(lambda: self.press_at(point, *keys, **how))
 
-        return self.selecting(act)
+    def press_at(self, point: Sequence[float], *keys: str, **how: Any) -> None:
+        """Click a thing with keys held."""
+        for key in keys:
+            self.page.keyboard.down(key)
+        self.page.mouse.click(*self.at(point, **how))
+        for key in keys:
+            self.page.keyboard.up(key)
 
     def keep(self, point: Sequence[float], name: str) -> int:
         """Click a thing and keep it under a name; its id."""
