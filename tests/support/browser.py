@@ -71,6 +71,11 @@ class Serving:
         self.url: str = facts["url"]
         self.port: int = facts["port"]
         self.base, _, self.token = self.url.partition("/#")
+        # Once: whoever asks often is made to wait.
+        login = httpx.post(
+            f"{self.base}/login", json={"token": self.token}, headers={"origin": self.base}
+        )
+        self.cookie = login.headers["set-cookie"].partition(";")[0]
 
     def kill(self) -> None:
         """As the kernel does it: no goodbye."""
@@ -89,13 +94,9 @@ class Serving:
 
     def client(self) -> Page:
         """Somebody else who looks at the scene, without a browser; has the state."""
-        login = httpx.post(
-            f"{self.base}/login", json={"token": self.token}, headers={"origin": self.base}
-        )
-        cookie = login.headers["set-cookie"].partition(";")[0]
         page = Page(
             uri=f"{self.base.replace('http', 'ws')}/socket", origin=self.base,
-            additional_headers={"Cookie": cookie}, max_size=None,
+            additional_headers={"Cookie": self.cookie}, max_size=None,
         )  # fmt: skip
         page.send("hello", version=1)
         page.next("state")

@@ -240,7 +240,9 @@ def test_edits(tab) -> None:
         lambda: tab.page.locator("#bar input[type=color]").fill("#0000ff", force=True)
     )
     assert edits(tab) == ["duplicate", "recolour"]
+    tab.key("Control+Shift+A")
     tab.until(lambda: reddest(tab) < 0, "the ball is blue")
+    tab.click(RED)
     tab.after(tab.button("Remove from the scene").click)
     assert edits(tab)[-1] == "remove"
     tab.after(lambda: tab.key("Control+z"))
@@ -280,9 +282,7 @@ def exported(tab, kind: str, name: str, *, format: str | None = None) -> Path:
         page.locator("#export-format").select_option(format)
     page.locator("#export-name").fill(name)
     link = page.locator(".toast .link")
-    before = len(tab.of("finished"))
-    page.locator("#export button[type=submit]").click()
-    tab.until(lambda: len(tab.of("finished")) > before, f"export of {kind}")
+    tab.after(page.locator("#export button[type=submit]").click, "finished")
     tab.until(lambda: link.count() > 0)
     with page.expect_download() as download:
         link.last.click()
@@ -319,7 +319,8 @@ def test_exports_of_every_kind(tab) -> None:
         assert sum(name.endswith(".ply") for name in archive.namelist()) in (1, 2)
     points = exported(tab, "points", "cloud", format="ply")
     assert points.read_bytes().startswith(b"ply")
-    rows = list(csv.DictReader(exported(tab, "table", "list").open(encoding="utf-8")))
+    with exported(tab, "table", "list").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
     assert {row["name"] for row in rows} <= {"mug", "bowl"}
     with zipfile.ZipFile(exported(tab, "coco", "panoptic")) as archive:
         (listing,) = (name for name in archive.namelist() if name.endswith(".json"))
@@ -332,10 +333,14 @@ def test_save_layer(tab) -> None:
     tab.keep(RED, "mug")
     tab.button("Export").click()
     tab.page.locator("label[for=kind-save_layer]").click()
-    tab.page.locator("#export-name").fill("by hand")
-    tab.page.locator("#export button[type=submit]").click()
-    tab.until(lambda: tab.of("finished"))
-    layer = load_scene_layer(tab.serving.scene, "by hand")
+    name, save = tab.page.locator("#export-name"), tab.page.locator("#export [type=submit]")
+    name.fill("by hand")
+    assert not name.evaluate("field => field.checkValidity()"), "as the server, no spaces"
+    save.click()
+    assert tab.page.locator("#export").is_visible()
+    name.fill("by-hand")
+    tab.after(save.click, "finished")
+    layer = load_scene_layer(tab.serving.scene, "by-hand")
     assert isinstance(layer, Labels)
     assert list(layer.info.names.values()) == ["mug"]
     assert int((layer.ids >= 0).sum()) == only(tab)["count"]
