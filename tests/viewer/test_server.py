@@ -109,7 +109,11 @@ def test_modes_and_one_object_alone(page) -> None:
 
 def test_the_id_map_names_what_is_under_each_pixel(page) -> None:
     page.draw(1, rest=True, ids=True)
-    assert not page.ids().any()
+    things = page.ids()
+    assert things[2, 2] == 0
+    assert things[36, 26] >= 49152, "what a click would select has an outline before"
+    assert things[36, 70] >= 49152
+    assert things[36, 26] != things[36, 70]
     page.select(1, points=[RED_PIXEL])
     red = page.command("keep", name="red")["objects"][0]["id"]
     page.send("job", id=1, name="suggest", arguments={"layer": "things"})

@@ -11,6 +11,8 @@ from splatseg.viewer._session import Session
 
 _MAX_OBJECT = 32766
 _FIRST_SUGGESTION = 32768
+_FIRST_THING = 49152
+"""From here on an id of an id map is a thing that a click would select: it has an outline alone."""
 
 
 class Pictures:
@@ -96,8 +98,9 @@ class _Look:
         self.shown: NDArray[np.bool_] = session.visible
         self._owners: NDArray[np.int32] | None = None
         self._ids: NDArray[np.int32] | None = None
+        self._things: NDArray[np.int32] | None = None
         if before is not None and before.same_objects(document):
-            self._owners, self._ids = before._owners, before._ids
+            self._owners, self._ids, self._things = before._owners, before._ids, before._things
 
     def same_objects(self, document: Document) -> bool:
         """Whether a document has the same objects and suggestions."""
@@ -120,11 +123,16 @@ class _Look:
     @property
     def ids(self) -> NDArray[np.int32]:
         """The id of each Gaussian in an id map."""
-        if self._ids is None:
+        things = self._session.things
+        if self._ids is None or self._things is not things:
+            self._things = things
             owners = self.owners
             ids = np.where(owners <= _MAX_OBJECT, owners + 1, 0).astype(np.int32)
+            last = np.iinfo(np.uint16).max - _FIRST_THING
+            known = (things >= 0) & (things <= last) & (owners < 0)
+            ids[known] = _FIRST_THING + things[known]
             for one in self._document.suggestions:
-                if one.id < _FIRST_SUGGESTION:
+                if one.id < _FIRST_THING - _FIRST_SUGGESTION:
                     member = self._session.confidence(one.mask) >= MEMBER
                     ids[member & (owners < 0)] = _FIRST_SUGGESTION + one.id
             self._ids = ids

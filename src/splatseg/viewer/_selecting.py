@@ -11,13 +11,16 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
+from numpy.typing import NDArray
 from torch import Tensor
 
 from splatseg.core import (
+    UNLABELLED,
     Camera,
     Features,
     Gaussians,
     InstanceTree,
+    Labels,
     Layer,
     Scene,
     Selection,
@@ -166,6 +169,7 @@ class Selecting:
         self._words: QuerySession | None = None
         self._chosen: tuple[SelectOptions | None, str | None] | None = None
         self._work = Work(scene=scene, backend=backend, observer=observer)
+        self._things: NDArray[np.int32] | None = None
         self.neighbours = SceneIndex(scene.gaussians)
         self.seconds: Mapping[str, float] = {}
 
@@ -173,7 +177,7 @@ class Selecting:
         """Release what it holds; it is opened again when it is needed."""
         if self._selector is not None:
             self._selector.close()
-        self._selector, self._words, self._chosen = None, None, None
+        self._selector, self._words, self._chosen, self._things = None, None, None, None
         self._work = Work(scene=self._scene, backend=self._backend, observer=self._observer)
 
     @property
@@ -206,6 +210,23 @@ class Selecting:
             InputError: If there is none.
         """
         return self._work.layer(name)
+
+    @property
+    def things(self) -> NDArray[np.int32]:
+        """(n,) the thing of each Gaussian in the layer that answers clicks, from 0, -1 for none.
+
+        Of a tree its objects. Features know no things before they are asked: all are -1.
+        """
+        if self._things is None:
+            options = self._choice()[0]
+            layer = None if options is None else self._work.layer(options.from_layer or "")
+            labels = layer.cut() if isinstance(layer, InstanceTree) else layer
+            self._things = np.full(len(self._scene.gaussians), UNLABELLED, np.int32)
+            if isinstance(labels, Labels):
+                ids = labels.ids.numpy()
+                known = ids != UNLABELLED
+                self._things[known] = np.unique(ids[known], return_inverse=True)[1]
+        return self._things
 
     def prepare(self) -> None:
         """Open all that a click needs, and select once, so that the first click is no slower."""

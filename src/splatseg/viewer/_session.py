@@ -224,6 +224,14 @@ class Session:
         """
         return self._owners.of(self.document.objects)[0]
 
+    @property
+    def things(self) -> NDArray[np.int32]:
+        """(n,) the thing of each Gaussian that a click would select, from 0, -1 for none.
+
+        That of the layer that answers clicks, of a tree its objects.
+        """
+        return self._selecting.things
+
     def confidence(self, mask: Mask) -> Confidence:
         """(n,) uint8 confidences of a mask, 0 to 255; from 128 on a Gaussian belongs to it."""
         return self._masks.get(mask)

@@ -211,7 +211,7 @@ export class Store {
 
   /**
    * Name of what an id of the id map stands for.
-   * @param {number} code 0 none, object id + 1, 32768 + suggestion id
+   * @param {number} code 0 none, object id + 1, 32768 + suggestion id, from 49152 on an unnamed thing
    * @returns {string}
    */
   nameOf(code) {
