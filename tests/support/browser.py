@@ -20,6 +20,7 @@ import torch
 from playwright.sync_api import Browser, BrowserContext, Locator
 
 from splatseg.io.scene import load_scene, save_scene, save_scene_layer
+from support.browser_handles import TOUCHES
 from support.viewer import MATRIX, Page, write_scene
 
 RED, BLUE, GREEN = (-1.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 3.0, 1.5)
@@ -323,6 +324,22 @@ class Tab:
         """Open a menu and choose."""
         self.button(button, within).click()
         self.page.locator("[role=menu] .menu-item", has_text=entry).first.click()
+
+    def check(self, test: str) -> None:
+        """Nothing was wrong in the page, nobody else was asked, and all that `TOUCHES` says that
+        the test reaches was reached. SPLATSEG_HANDLES names a file that is told what was.
+        """
+        self.page.evaluate("0")  # what is on its way comes first
+        if "SPLATSEG_HANDLES" in os.environ:
+            with Path(os.environ["SPLATSEG_HANDLES"]).open("a") as file:
+                file.writelines(f"{test}\t{handle}\n" for handle in sorted(self.touched))
+        if self.problems.console:
+            raise AssertionError(self.problems.console)
+        if self.problems.outside():
+            raise AssertionError(self.problems.outside())
+        missing = set(TOUCHES.get(test, ())) - self.touched
+        if missing:
+            raise AssertionError(f"{test} does not reach {sorted(missing)}")
 
     def visible_handles(self) -> list[str]:
         return self.page.evaluate("visibleHandles()")

@@ -10,7 +10,6 @@ import pytest
 from playwright.sync_api import Browser, sync_playwright
 
 from support.browser import Serving, Tab, chromium, tab_of, write_browser_scene
-from support.browser_handles import TOUCHES
 
 
 @pytest.fixture(scope="session")
@@ -69,12 +68,5 @@ def tab(new_tab, serving, request) -> Iterator[Tab]:
     found = new_tab()
     found.open()
     yield found
-    found.page.evaluate("0")
     serving.clean()
-    assert found.problems.console == []
-    assert found.problems.outside() == []
-    name = request.node.originalname
-    if "SPLATSEG_HANDLES" in os.environ:
-        with Path(os.environ["SPLATSEG_HANDLES"]).open("a") as file:
-            file.writelines(f"{name}\t{handle}\n" for handle in sorted(found.touched))
-    assert set(TOUCHES.get(name, ())) - found.touched == set()
+    found.check(request.node.originalname)
