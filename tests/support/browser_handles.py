@@ -1,1 +1,215 @@
-TOUCHES: dict[str, tuple[str, ...]] = {}
+"""Controls of the page, and the test that reaches each; `Tab.check` holds the tests to it.
+
+A name is the id, or the region and the words of the control; see browser_watch.js.
+"""
+
+TOUCHES: dict[str, tuple[str, ...]] = {
+    "test_a_film_is_cancelled": (
+        "#actions Export",
+        "#export Export",
+        "#export-frames",
+        "#export-name",
+        "#kind-film",
+    ),
+    "test_a_splat_file_without_photographs": (
+        "#jobs Cancel",
+        "#suggestions Make masks",
+    ),
+    "test_all_none_invert_and_a_layer": (
+        "#bar More for the selection",
+        "menu More for the selection > Invert",
+        "menu More for the selection > Select all",
+        "menu More for the selection > Select none",
+        "menu More for the selection > things",
+    ),
+    "test_box": ("#tools Box",),
+    "test_class": (
+        "#class-name",
+        "#objects Class",
+        "popup Set",
+    ),
+    "test_click": ("#overlay",),
+    "test_colour": (
+        "#objects .row colour",
+        "#objects More for the picked objects",
+        "#objects colour",
+        "menu More for the picked objects > Colour…",
+    ),
+    "test_dark": (
+        "#actions Settings",
+        "menu Settings > As the system",
+        "menu Settings > Dark",
+        "menu Settings > Light",
+    ),
+    "test_edits": (
+        "#bar Remove from the scene",
+        "#bar colour",
+        "menu More for the picked objects > Duplicate in the scene",
+        "menu More for the picked objects > Remove from the scene",
+        "menu More for the selection > Duplicate",
+        "menu More for the selection > Recolour…",
+    ),
+    "test_export_and_look_at_the_file": (
+        "#export Cancel",
+        "#export Close",
+        "#export-which",
+        "#kind-splat",
+        "menu More for the picked objects > Export…",
+    ),
+    "test_exports_of_every_kind": (
+        "#export-format",
+        "#kind-coco",
+        "#kind-objects",
+        "#kind-picture",
+        "#kind-points",
+        "#kind-table",
+        "#toasts Dismiss",
+        "#toasts link",
+    ),
+    "test_help_and_keys_of_one_letter": (
+        "#actions Keys and mouse",
+        "#help Close",
+        "#help Keys",
+        "#letters",
+        "#tools Click",
+        "menu Settings > Keys of one letter",
+    ),
+    "test_hide": (
+        "#objects .row eye",
+        "#objects Show all objects",
+        "menu More for the picked objects > Hide",
+        "menu More for the picked objects > Show",
+    ),
+    "test_hover_sends_nothing": (
+        "#bar Keep",
+        "#keep-name",
+    ),
+    "test_how_clicks_join": (
+        "#selmode-add",
+        "#selmode-intersect",
+        "#selmode-remove",
+        "#selmode-set",
+    ),
+    "test_join_and_split": (
+        "#objects Split",
+        "menu Split > Above and below the pivot",
+        "menu Split > Connected parts",
+        "menu Split > Left and right of the pivot",
+        "menu Split > Parts of the tree",
+    ),
+    "test_keyboard_alone": (
+        "#objects .rename",
+        "#objects Objects",
+    ),
+    "test_kill_and_restore": ("#notice Try now",),
+    "test_lasso": ("#tools Lasso",),
+    "test_level_is_sent_with_the_same_prompt": ("#level",),
+    "test_lock": (
+        "#objects .row lock",
+        "menu More for the picked objects > Lock",
+        "menu More for the picked objects > Unlock",
+    ),
+    "test_looking_around": (
+        "#actions Copy a link to this view",
+        "#tools Fly",
+        "#tools Frame everything",
+        "menu Settings > +X up",
+        "menu Settings > +Y up",
+        "menu Settings > As the scene says",
+        "menu Settings > Fly",
+        "menu Settings > Orbit",
+        "menu Settings > −X up",
+        "menu Settings > −Y up",
+        "menu Settings > −Z up",
+    ),
+    "test_modes": (
+        "#mode-blend",
+        "#mode-colour",
+        "#mode-confidence",
+        "#mode-depth",
+        "#mode-objects",
+        "#mode-similarity",
+    ),
+    "test_more_like_this": ("#bar More like this",),
+    "test_move": (
+        "#tools Frame the selection",
+        "#tools Move",
+        "#tools Rotate",
+        "#tools Scale",
+        "menu More for the selection > Move",
+    ),
+    "test_narrow": (
+        "#tab-objects",
+        "#tab-suggestions",
+        "#tab-views",
+    ),
+    "test_negative_click": (
+        "#points-less",
+        "#points-more",
+        "#points-new",
+    ),
+    "test_nothing_comes_from_elsewhere": (
+        "#views .thumb",
+        "#views Compare with the photograph",
+    ),
+    "test_photographs": (
+        "#divider",
+        "#views Next photograph",
+        "#views Photograph before",
+    ),
+    "test_polygon": (
+        "#tool-options Close the polygon",
+        "#tools Polygon",
+    ),
+    "test_rename": (
+        "#objects .row",
+        "menu More for the picked objects > Rename",
+    ),
+    "test_save_layer": (
+        "#export Save",
+        "#kind-save_layer",
+    ),
+    "test_search_and_sort": (
+        "#object-search",
+        "#object-sort",
+    ),
+    "test_shapes_of_the_selection": (
+        "#bar Fill holes",
+        "#bar Grow",
+        "#bar Shrink",
+    ),
+    "test_show_alone_and_hide_all_others": (
+        "#objects Show alone",
+        "#objects Show with the others",
+        "menu More for the picked objects > Frame",
+        "menu More for the picked objects > Hide all others",
+    ),
+    "test_sphere": (
+        "#ball",
+        "#tools Sphere",
+    ),
+    "test_stroke": (
+        "#brush",
+        "#tools Stroke",
+    ),
+    "test_subtract_replace_and_delete": (
+        "#objects Delete from the list",
+        "#objects Join",
+        "#objects Replace by the selection",
+        "#objects Subtract the selection",
+    ),
+    "test_suggestions": (
+        "#suggestions .row",
+        "#suggestions .row Accept",
+        "#suggestions .row Reject",
+        "#suggestions Accept all",
+        "#suggestions Reject all",
+        "#suggestions Suggest from a layer",
+        "#suggestions Suggest from a layer…",
+        "menu Suggest from a layer > things",
+    ),
+    "test_undo_and_redo_of_selections": (
+        "#history Redo",
+        "#history Undo",
+    ),
+}

@@ -320,7 +320,9 @@ class SceneAnswers:
                 held = (layer.ids != UNLABELLED) & (layer.ids != layer.background)
                 return np.where(held.cpu().numpy(), np.uint8(255), np.uint8(0))
             if not isinstance(layer, Selection):
-                raise InputError("layer: expected a selection or labels, got another kind of layer.")
+                raise InputError(
+                    "layer: expected a selection or labels, got another kind of layer."
+                )
             return bytes_of(layer)
         whole = np.full(len(scene.gaussians), 255, dtype=np.uint8)
         before = self._pictures.selection if request.kind == "invert" else None
