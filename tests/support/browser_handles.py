@@ -199,6 +199,7 @@ TOUCHES: dict[str, tuple[str, ...]] = {
         "#objects Subtract the selection",
     ),
     "test_suggestions": (
+        "#suggestions Suggestions",
         "#suggestions .row",
         "#suggestions .row Accept",
         "#suggestions .row Reject",
