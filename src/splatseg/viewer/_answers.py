@@ -156,12 +156,9 @@ class SceneAnswers:
     def _modes(self) -> list[str]:
         """What can be drawn of this scene: components need a layer of features."""
         layers = self._session.scene.layers
-        for name in layers:
-            if name not in self._features:
-                self._features[name] = _or(
-                    False,  # noqa: FBT003
-                    lambda name=name: isinstance(layers[name], Features),
-                )
+        for name in set(layers) - set(self._features):
+            kind = _or(None, lambda name=name: type(layers[name]))
+            self._features[name] = kind is Features
         featured = any(self._features[name] for name in layers)
         return [mode for mode in _MODES if featured or mode != "pca"]
 
