@@ -157,8 +157,7 @@ class SceneAnswers:
         """What can be drawn of this scene: components need a layer of features."""
         layers = self._session.scene.layers
         for name in set(layers) - set(self._features):
-            kind = _or(None, lambda name=name: type(layers[name]))
-            self._features[name] = kind is Features
+            self._features[name] = _or(None, lambda name=name: type(layers[name])) is Features
         featured = any(self._features[name] for name in layers)
         return [mode for mode in _MODES if featured or mode != "pca"]
 
