@@ -48,6 +48,7 @@ def test_hello_is_answered_with_all_that_is_to_be_shown(page) -> None:
     assert (state["undo"], state["redo"], state["clients"], state["me"]) == (None, None, 1, 1)
     assert state["fitting"] is None
     assert "colour" in state["modes"]
+    assert "pca" not in state["modes"], "there is no layer of features"
 
 
 def test_the_page_is_told_when_the_first_click_is_quick(server) -> None:
@@ -224,7 +225,6 @@ def test_more_of_the_same_is_what_the_layer_says_is_alike(page) -> None:
         ("layer", {"text": "../things"}, "layer"),
         ("box", {"box": [5, 5, 5, 5]}, "x0 < x1"),
         ("stroke", {"points": [[-50, -50], [-60, -60]]}, "got none"),
-        ("layer", {"text": "things"}, "expected a selection"),
         ("words", {"text": "mug"}, ""),
         ("click", {"points": [RED_PIXEL], "mode": "intersect"}, "select something first"),
     ],
@@ -235,6 +235,10 @@ def test_what_shows_nothing_is_said_with_its_gesture(page, kind, fields, words) 
     assert error["gesture"] == 8
     assert words in f"{error['text']} {error['fix']}"
     assert page.select(9, points=[RED_PIXEL])["count"], "the server goes on"
+
+
+def test_what_labels_hold_is_selected(page) -> None:
+    assert page.select(1, "layer", text="things")["count"] == 3 * EACH
 
 
 def test_commands_change_the_document_of_all(server, page) -> None:

@@ -263,6 +263,18 @@ def test_a_layer_that_comes_later_answers_after_reopening(folder) -> None:
         assert chosen(session).sum() > few
 
 
+def test_a_layer_that_was_saved_here_answers_no_clicks(folder) -> None:
+    (folder / "layers" / "masks.npz").unlink()
+    with open_session(folder, backend="cpu") as session:
+        session.select(click(session, IN[1]))
+        session.do(Keep("left"))
+        session.save_layer("by-hand")
+        session.reopen()
+        assert session.source is None
+        session.select(click(session, IN[2]))
+        assert chosen(session).any(), "what was not kept yet can be clicked"
+
+
 def test_the_draft_comes_first_and_is_combined_alike(folder) -> None:
     with open_session(folder, backend="cpu") as session:
         drafts: list[tuple[int, np.ndarray]] = []
@@ -880,10 +892,11 @@ def test_a_layer_has_names_classes_colours_and_its_commands(folder) -> None:
         "do": "keep",
         "arguments": {"name": "mug", "class_name": "", "colour": None},
     }
-    # A layer of instances answers clicks where there is no tree.
+    # A layer of instances answers clicks where there is no tree, unless it was saved here.
     (folder / "layers" / "masks.npz").unlink()
+    save_scene_layer(replace(found, info=replace(info, method="hand")), folder, "all")
     with open_session(folder, backend="cpu") as session:
-        assert session.source == "layer things"
+        assert session.source == "layer all"
 
 
 def test_edits_are_those_of_edit_one_after_the_other(session, scene) -> None:

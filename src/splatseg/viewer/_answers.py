@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import msgspec
 import numpy as np
 
-from splatseg.core import Scene, Selection
+from splatseg.core import UNLABELLED, Features, Labels, Scene, Selection
 from splatseg.errors import InputError
 from splatseg.render import BackendName
 from splatseg.tasks.work import EXPORTS_FOLDER
@@ -87,6 +87,7 @@ class SceneAnswers:
         self._worker = worker
         self._fitting = fitting
         self._ready = False
+        self._features: dict[str, bool] = {}
         self._cleaning = float("inf")
         """Seconds that a Gaussian of the last selection took from its draft on."""
         self._drawing = 0.0
@@ -141,7 +142,7 @@ class SceneAnswers:
             layers=list(scene.layers),
             source=_or(None, lambda: session.source),
             words=_or(False, lambda: session.words),  # noqa: FBT003
-            modes=list(_MODES),
+            modes=self._modes(),
             features=list(messages.FEATURES),
             document=self._mirror.document(session.document),
             undo=session.undo_label,
@@ -151,6 +152,14 @@ class SceneAnswers:
             ready=self._ready,
             fitting=self._fitting,
         )
+
+    def _modes(self) -> list[str]:
+        """What can be drawn of this scene: components need a layer of features."""
+        layers = self._session.scene.layers
+        for name in set(layers) - set(self._features):
+            self._features[name] = _or(None, lambda name=name: type(layers[name])) is Features
+        featured = any(self._features[name] for name in layers)
+        return [mode for mode in _MODES if featured or mode != "pca"]
 
     def photograph(self, name: str, width: int) -> bytes:
         """A photograph as JPEG."""
@@ -303,9 +312,12 @@ class SceneAnswers:
         scene = self._session.scene
         if request.kind == "layer":
             layer = scene.layers[request.text]
+            if isinstance(layer, Labels):
+                held = (layer.ids != UNLABELLED) & (layer.ids != layer.background)
+                return np.where(held.cpu().numpy(), np.uint8(255), np.uint8(0))
             if not isinstance(layer, Selection):
                 raise InputError(
-                    "layer: expected a selection, got another kind of layer; suggest its objects."
+                    "layer: expected a selection or labels, got another kind of layer."
                 )
             return bytes_of(layer)
         whole = np.full(len(scene.gaussians), 255, dtype=np.uint8)

@@ -283,7 +283,9 @@ def export(
         scene,
         path,
         what,
-        options=ExportOptions(layer=None if labels is None else _LAYER, splat_format=format),
+        options=ExportOptions(
+            layer=None if labels is None else _LAYER, splat_format=format, split="all"
+        ),
         layers={} if labels is None else {_LAYER: labels},
         backend=backend,
         observer=observer,

@@ -38,6 +38,7 @@ from splatseg.tasks.query import QuerySession
 from splatseg.tasks.select import SelectionSession, open_selector, prompt_record
 from splatseg.tasks.sources import QueryOptions, SelectOptions
 from splatseg.tasks.work import Observer, Work
+from splatseg.viewer._products import METHOD
 from splatseg.viewer._shaping import Mode
 from splatseg.viewer._state import MEMBER, Confidence
 
@@ -317,11 +318,13 @@ class Selecting:
     def _choice(self) -> tuple[SelectOptions | None, str | None]:
         """Options of the source that is there already, and its name; None where there is none.
 
-        Masks that no layer was made of are left alone: to associate them takes minutes.
+        Masks that no layer was made of are left alone: to associate them takes minutes. So are
+        layers that were saved here: they know nothing but what was kept by hand.
         """
         if self._chosen is None:
-            names = self._work.layer_names
-            facts = {name: self._work.facts(name) for name in names}
+            facts = {name: self._work.facts(name) for name in self._work.layer_names}
+            facts = {name: one for name, one in facts.items() if one.info.method != METHOD}
+            names = tuple(facts)
             ranks = ((facts[name].rank, name) for name in names)
             best = min(((rank, name) for rank, name in ranks if rank is not None), default=None)
             affinity = next((name for name in names if facts[name].is_affinity), None)

@@ -160,7 +160,7 @@ export class ExportDialog {
           id: "export-name",
           maxlength: 80,
           required: true,
-          pattern: this.kind.id === "save_layer" ? null : NAME,
+          pattern: NAME,
           title: "Letters, digits, - _ and ., beginning with a letter or a digit",
           value: this.defaultName(),
           autocomplete: "off",
