@@ -126,7 +126,7 @@ def test_maps_that_do_not_fit_each_other(changed) -> None:
     folder = changed("sam2", vision_config__backbone_feature_sizes=[[16, 16]])
     with pytest.raises(FileFormatError, match=r"weights: expected a network that takes an image"):
         asked("sam2", folder)
-    with pytest.raises(InputError, match=r"depths: expected at most .*\(.*weights\)"):
+    with pytest.raises(FileFormatError, match=r"num_hidden_layers: expected a whole .* 1 to 200"):
         load(changed("dino", num_hidden_layers=0), "dino")
 
 
