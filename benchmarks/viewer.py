@@ -89,7 +89,9 @@ def click(viewer: Viewer, x: float, y: float) -> dict[str, Any] | None:
     viewer.forget()
     viewer.page.mouse.click(*viewer.at(x, y))
     end = viewer.await_one(
-        lambda one: one["type"] == "error" or (one["type"] == "selected" and one["stage"] == "final")
+        lambda one: (
+            one["type"] == "error" or (one["type"] == "selected" and one["stage"] == "final")
+        )
     )
     if end["type"] == "error":
         return None
@@ -203,7 +205,8 @@ def report(made: dict[str, Any]) -> list[str]:
     p50 = float(np.median([one["tinted"] for one in made["clicks"]]))
     first = made["first"]
     lines += [
-        "first click: " + ("nothing there" if first is None else f"{first['tinted']:.0f} ms")
+        "first click: "
+        + ("nothing there" if first is None else f"{first['tinted']:.0f} ms")
         + f", p50 {p50:.0f} ms",
         f"hover: {made['hover']} messages",
         f"idle, 10 s: server {made['idle'][0]:.2f}, page {made['idle'][1]:.2f} s of CPU",

@@ -475,7 +475,7 @@ def opener(
             root = session.scene.root
             return SceneAnswers(
                 session,
-                Drawer(session.scene, backend=backend),
+                Drawer(session.scene, backend=backend, views=session.views),
                 worker=worker,
                 relay=relay,
                 name="scene" if root is None else root.resolve().name,

@@ -1,5 +1,7 @@
 """Pictures of a session's document: what is shown of it, and in which colours."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,6 +27,7 @@ class Pictures:
         self._session = session
         self._drawer = drawer
         self._kept: _Look | None = None
+        self._last: _Drawn | None = None
 
     @property
     def selection(self) -> Confidence | None:
@@ -62,8 +65,21 @@ class Pictures:
         )
 
     def id_map(self, request: messages.DrawRequest) -> NDArray[np.uint16]:
-        """The object or suggestion at each pixel, as the protocol has it."""
-        return self._drawer.id_map(request.camera(), self._look.ids, shown=self._shown(request))
+        """The object or suggestion at each pixel, as the protocol has it.
+
+        A selection changes nothing of it: it is drawn once for a camera and what there is.
+        """
+        camera, ids, shown = request.camera(), self._look.ids, self._shown(request)
+        last = self._last
+        if (
+            last is None
+            or last.camera is not camera
+            or last.ids is not ids
+            or not np.array_equal(last.shown, shown)
+        ):
+            drawn = self._drawer.id_map(camera, ids, shown=shown)
+            self._last = last = _Drawn(camera=camera, ids=ids, shown=shown, drawn=drawn)
+        return last.drawn
 
     @property
     def _look(self) -> "_Look":
@@ -85,6 +101,16 @@ class Pictures:
         return None if selection is None else np.divide(selection, 255, dtype=np.float32)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Drawn:
+    """The last id map, and what it was drawn of."""
+
+    camera: Camera
+    ids: NDArray[np.int32]
+    shown: NDArray[np.bool_]
+    drawn: NDArray[np.uint16]
+
+
 class _Look:
     """What pictures of one document are drawn from."""
 
@@ -96,8 +122,10 @@ class _Look:
         self.shown: NDArray[np.bool_] = session.visible
         self._owners: NDArray[np.int32] | None = None
         self._ids: NDArray[np.int32] | None = None
+        self._objects: list[tuple[NDArray[np.bool_], tuple[int, int, int]]] | None = None
         if before is not None and before.same_objects(document):
             self._owners, self._ids = before._owners, before._ids
+            self._objects = before._objects
 
     def same_objects(self, document: Document) -> bool:
         """Whether a document has the same objects and suggestions."""
@@ -113,9 +141,11 @@ class _Look:
 
     @property
     def objects(self) -> list[tuple[NDArray[np.bool_], tuple[int, int, int]]]:
-        """Which Gaussians each object has, and its colour."""
-        owners = self.owners
-        return [(owners == one.id, one.colour) for one in self._document.objects]
+        """Which Gaussians each object has, and its colour; the same list while they are."""
+        if self._objects is None:
+            owners = self.owners
+            self._objects = [(owners == one.id, one.colour) for one in self._document.objects]
+        return self._objects
 
     @property
     def ids(self) -> NDArray[np.int32]:

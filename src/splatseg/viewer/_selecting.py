@@ -28,7 +28,7 @@ from splatseg.errors import InputError
 from splatseg.prompting.next_click import next_click
 from splatseg.prompting.pipeline import SceneIndex
 from splatseg.prompting.prompts import AxisBox, Ball, Lasso, SelectionPrompt, ViewPrompt
-from splatseg.prompting.seen import VisiblePrompt
+from splatseg.prompting.seen import ViewCache, VisiblePrompt
 from splatseg.render import BackendName
 from splatseg.selection import pieces
 from splatseg.tasks.query import QuerySession
@@ -167,12 +167,12 @@ class Selecting:
         self._chosen: tuple[SelectOptions | None, str | None] | None = None
         self._work = Work(scene=scene, backend=backend, observer=observer)
         self.neighbours = SceneIndex(scene.gaussians)
+        self.views = ViewCache(scene.gaussians, backend=backend)
         self.seconds: Mapping[str, float] = {}
 
     def close(self) -> None:
         """Release what it holds; it is opened again when it is needed."""
-        if self._selector is not None:
-            self._selector.close()
+        self.views.close()
         self._selector, self._words, self._chosen = None, None, None
         self._work = Work(scene=self._scene, backend=self._backend, observer=self._observer)
 
@@ -327,6 +327,7 @@ class Selecting:
                 options=self._options(),
                 source=own,
                 neighbours=self.neighbours,
+                views=self.views,
                 backend=self._backend,
                 observer=self._observer,
             )

@@ -30,6 +30,7 @@ from splatseg.io.scene import load_scene
 from splatseg.io.scene_folder import scene_path
 from splatseg.io.splats import WritableFormat, read_splats
 from splatseg.prompting.prompts import AxisBox, Ball, Lasso, SelectionPrompt, Similar, ViewPrompt
+from splatseg.prompting.seen import ViewCache
 from splatseg.render import BackendName
 from splatseg.tasks.work import SILENT, Observer
 from splatseg.viewer import _products as products
@@ -191,6 +192,11 @@ class Session:
         Clicks then select what is connected and of about the same colour.
         """
         return self._selecting.source
+
+    @property
+    def views(self) -> ViewCache:
+        """Views that are prepared for selecting; whoever draws may share them."""
+        return self._selecting.views
 
     @property
     def words(self) -> bool:

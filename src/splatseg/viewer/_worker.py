@@ -14,6 +14,7 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias, TypeVar
 
+from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError, SplatsegError
 from splatseg.viewer import _guard as guard
 from splatseg.viewer import _messages as messages
@@ -381,6 +382,11 @@ class Worker:
             client.send(messages.Error(text=text, **about))  # pyright: ignore[reportArgumentType]
 
     def _run(self) -> None:
+        # Torch's threads would spin on the cores that the kernels and the browser need.
+        with one_torch_thread():
+            self._work()
+
+    def _work(self) -> None:
         try:
             self._answers = self._open(self)
         except BaseException as error:  # noqa: BLE001  (`start` raises it in its thread)
