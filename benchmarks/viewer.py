@@ -127,7 +127,8 @@ def clicks(viewer: Viewer) -> list[dict[str, Any]]:
         viewer.settle()
         for row in range(GRID[1]):
             for column in range(GRID[0]):
-                one = click(viewer, (column + 0.5) / GRID[0], (row + 0.5) / GRID[1])
+                x, y = (column + 0.5) / GRID[0], (row + 0.5) / GRID[1]
+                one = click(viewer, x, y) if viewer.is_picture(x, y) else None
                 if one is not None:
                     found.append(one)
                 viewer.page.wait_for_timeout(60)
@@ -169,6 +170,7 @@ def measure(scene: Path, *, whole: bool, seconds: float) -> dict[str, Any]:
         made["orbit"] = orbit(viewer, seconds)
         if whole:
             made["idle"] = idle(viewer, server, 10)
+        made["load_after"] = os.getloadavg()[0]
         made["errors"] = viewer.errors
     return made
 
@@ -177,7 +179,7 @@ def report(made: dict[str, Any]) -> list[str]:
     """A line a stage."""
     turned = made["orbit"]
     lines = [
-        f"load at the start {made['load']:.1f}; ready after {made['ready']:.1f} s",
+        f"load {made['load']:.1f} to {made['load_after']:.1f}; ready after {made['ready']:.1f} s",
         f"orbit: {turned['frames_a_second']:.1f} frames/s, width {turned['share']:.2f} of the "
         f"canvas (least {turned['least_share']:.2f}); camera to paint "
         f"{percentiles(turned['input_to_paint'])}; draw {percentiles(turned['draw'])}; encode "

@@ -7,6 +7,7 @@ shows it.
 """
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -156,6 +157,11 @@ class Viewer:
         box = self.box()
         return box["x"] + x * box["width"], box["y"] + y * box["height"]
 
+    def is_picture(self, x: float, y: float) -> bool:
+        """Whether a press at these shares of the picture would go to it, and not to a button."""
+        at = "([x, y]) => document.elementFromPoint(x, y)?.id === 'overlay'"
+        return self.page.evaluate(at, list(self.at(x, y)))
+
     def seen(self, name: str) -> list[Any]:
         """What was written down: sent, came, painted, up or frames."""
         return self.page.evaluate(f"seen.{name}")
@@ -209,17 +215,28 @@ class Viewer:
 
 
 def renderers() -> list[int]:
-    """Processes of Chromium's that show pages, those of this process."""
-    found: list[int] = []
+    """Processes of Chromium's that show pages, those that this process started."""
+    parents: dict[int, int] = {}
+    shows: list[int] = []
     for folder in Path("/proc").iterdir():
-        if folder.name.isdigit():
-            try:
-                line = (folder / "cmdline").read_text()
-            except OSError:
-                continue
-            if "chromium" in line and "--type=renderer" in line:
-                found.append(int(folder.name))
-    return found
+        if not folder.name.isdigit():
+            continue
+        try:
+            stat, line = (folder / "stat").read_text(), (folder / "cmdline").read_text()
+        except OSError:
+            continue
+        parents[int(folder.name)] = int(stat.rsplit(")", 1)[1].split()[1])
+        if "--type=renderer" in line:
+            shows.append(int(folder.name))
+
+    def ours(process: int) -> bool:
+        while process in parents:
+            if process == os.getpid():
+                return True
+            process = parents[process]
+        return False
+
+    return [one for one in shows if ours(one)]
 
 
 def cpu_seconds(processes: Sequence[int]) -> float:
