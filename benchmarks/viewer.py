@@ -26,6 +26,7 @@ import shutil
 import tempfile
 import time
 from collections import defaultdict
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +54,7 @@ VIEWS = 5
 def tiled(scene: Path, folder: Path, count: int) -> Path:
     """A scene of so many Gaussians: copies side by side, without layers."""
     loaded = load_scene(scene)
-    save_scene(loaded.replace(gaussians=copies(loaded.gaussians, count)), folder)
+    save_scene(replace(loaded, gaussians=copies(loaded.gaussians, count)), folder)
     return folder
 
 

@@ -232,9 +232,18 @@ class SceneAnswers:
                 raise InputError("message: expected one that has an answer.")
 
     def hint(self, client: Client) -> None:
-        """Say where the next click would help."""
-        document = self._session.document
-        found = None if document.selection is None else self._session.hint(document.selection)
+        """Say where the next click would help; nothing, if something is asked meanwhile."""
+        selection = self._session.document.selection
+        given_up: list[bool] = []
+
+        def stop() -> bool:
+            if self._worker.is_asked:
+                given_up.append(True)
+            return bool(given_up)
+
+        found = None if selection is None else self._session.hint(selection, stop=stop)
+        if given_up:
+            return
         if found is None:
             client.send(messages.HintAnswer())
             return

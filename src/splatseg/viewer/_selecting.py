@@ -273,12 +273,16 @@ class Selecting:
         """
         return self._asked().ask([words]).probabilities[:, 0].float().cpu()
 
-    def hint(self, confidence: Float[Tensor, "n"]) -> tuple[float, float, str] | None:
+    def hint(
+        self, confidence: Float[Tensor, "n"], *, stop: Callable[[], bool] | None
+    ) -> tuple[float, float, str] | None:
         """Column and row in a view where a click would help most, and its name."""
         views = self._scene.train_views or self._scene.views
         if not views:
             return None
-        found = next_click(self._scene.gaussians, views, confidence, backend=self._backend)
+        found = next_click(
+            self._scene.gaussians, views, confidence, backend=self._backend, stop=stop
+        )
         return None if found is None else (*found.point, found.view.name)
 
     def _records(self, prompts: Sequence[SelectionPrompt], level: float | None) -> list[Any]:

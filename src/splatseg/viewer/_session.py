@@ -344,19 +344,24 @@ class Session:
         """
         return self._selecting.similarity(words).numpy()
 
-    def hint(self, selection: Mask | None = None) -> tuple[float, float, str] | None:
+    def hint(
+        self, selection: Mask | None = None, *, stop: Callable[[], bool] | None = None
+    ) -> tuple[float, float, str] | None:
         """Where the next click would help most: x and y in pixels of a view, and its name.
 
         Args:
             selection: Of what; None takes the present selection.
+            stop: Is asked now and then whether to give it up.
 
         Returns:
-            None where nothing is selected, nothing is uncertain, or the scene has no views.
+            None where it was given up, nothing is selected, nothing is uncertain, or the scene has
+            no views.
         """
         mask = selection or self.document.selection
         if mask is None:
             return None
-        return self._selecting.hint(torch.from_numpy(np.array(self.confidence(mask))) / 255)
+        confidence = torch.from_numpy(np.array(self.confidence(mask))) / 255
+        return self._selecting.hint(confidence, stop=stop)
 
     def grow(self, factor: float = 1.0, *, author: str = "") -> Document:
         """Add what is near to the selection.

@@ -317,6 +317,16 @@ class Worker:
 
     # In the thread.
 
+    @property
+    def is_asked(self) -> bool:
+        """Whether a picture, a call or an answer waits; what is done in idle ends for it."""
+        with self._changed:
+            drawing = any(
+                client.waiting_camera is not None and not client.busy
+                for client in self._clients.values()
+            )
+            return drawing or bool(self._calls or self._tasks or self._jobs) or self.closing
+
     def redraw(self, author: str = "") -> None:
         """Draw the last camera of every page again, at rest: the document changed.
 
