@@ -40,12 +40,13 @@ _WATCH = """
           return;
         }
         const message = JSON.parse(data);
-        const { type, stage, count, stages, gesture, text, id, result, to } = message;
-        seen.came.push({ at, type, stage, count, stages, gesture, text, id, result, to });
+        const { type, stage, count, stages, text, result } = message;
+        seen.came.push({ at, type, stage, count, stages, text, result });
       });
     }
     const message = JSON.parse(data);
-    seen.sent.push({ at: performance.now(), type: message.type, gesture: message.gesture });
+    const { type, focal, width, height, rest } = message;
+    seen.sent.push({ at: performance.now(), type, focal, width, height, rest });
     return send.call(this, data);
   };
   const draw = CanvasRenderingContext2D.prototype.drawImage;
