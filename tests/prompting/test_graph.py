@@ -91,6 +91,18 @@ def test_what_is_refused() -> None:
         build_graph(row_of(3), neighbours=0)
 
 
+def test_contacts_are_the_edges_that_touch(rng) -> None:
+    g = balls_at(torch.from_numpy(rng.uniform(0, 3, (60, 3)).astype(np.float32)), scale=0.1)
+    graph = graph_of(g, 16)
+    dense = np.zeros((len(graph), len(graph)), dtype=bool)
+    first = np.repeat(np.arange(len(graph)), np.diff(graph.strengths.indptr))
+    there = graph.touching.numpy()
+    dense[first[there], graph.strengths.indices[there]] = True
+    assert 0 < there.sum() < len(there)
+    assert np.array_equal(graph.contacts.toarray(), dense)
+    assert np.array_equal(dense, dense.T)
+
+
 def test_few_gaussians_and_none() -> None:
     for count in (0, 1):
         graph = graph_of(row_of(count))

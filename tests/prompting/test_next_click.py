@@ -54,6 +54,23 @@ def test_the_middle_of_the_largest_uncertain_region() -> None:
     assert click.expected_error == pytest.approx(0.4 * click.area, rel=0.2)
 
 
+def test_it_stops_when_it_is_told_to() -> None:
+    p = membership((-3.1, 0.1, -3.1, 0.1, 0.4))
+    asked: list[int] = []
+
+    def second() -> bool:
+        asked.append(1)
+        return len(asked) == 2
+
+    views = [VIEW, view_of(cx=40.0)]
+    assert next_click(WALL, views, p, stop=second) is None
+    assert len(asked) == 2
+    found, expected = (next_click(WALL, views, p, stop=stop) for stop in (lambda: False, None))
+    assert found is not None
+    assert expected is not None
+    assert found.point == expected.point
+
+
 def test_where_sure_things_meet_nothing_is_uncertain() -> None:
     p = membership((-3.1, 3.1, -3.1, 3.1, 0.98))
     assert next_click(WALL, [VIEW], p) is None

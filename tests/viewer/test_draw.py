@@ -13,6 +13,7 @@ from splatseg.core.sh import SH_C0
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.io.images import write_png
 from splatseg.io.scene import load_scene, save_scene, save_scene_layer
+from splatseg.prompting.seen import ViewCache
 from splatseg.render import prepare, render
 from splatseg.viewer import _draw
 from splatseg.viewer._draw import MODES, Drawer, Pace, scaled
@@ -528,3 +529,18 @@ def test_it_follows_a_load_that_changes() -> None:
     back = sizes_of(lambda scale, _: 0.03 * scale**2, 30, pace)
     assert back[-1] == 1.0
     assert min(light + heavy + back) >= 0.4
+
+
+def test_views_of_full_size_are_shared(scene) -> None:
+    views = ViewCache(scene.gaussians, backend="cpu")
+    sharing, alone = Drawer(scene, backend="cpu", views=views), Drawer(scene, backend="cpu")
+    where, chosen = camera(), selection_of(LEFT)
+    assert np.array_equal(
+        sharing.picture(where, selection=chosen).rgb, alone.picture(where, selection=chosen).rgb
+    )
+    assert len(views) == 1
+    sharing.picture(where, scale=0.5)
+    sharing.picture(where, shown=~LEFT)
+    assert len(views) == 1
+    views.close()  # as it is when the source is opened anew
+    assert np.array_equal(sharing.picture(where).rgb, alone.picture(where).rgb)

@@ -11,6 +11,7 @@ import torch
 
 from splatseg.errors import InputError
 from splatseg.viewer import _messages as messages
+from support.viewer import json_camera
 
 EYE = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
 CAMERA = {"width": 64, "height": 48, "focal": 50, "matrix": EYE}
@@ -272,3 +273,15 @@ def test_words_that_python_reserves_are_written_as_the_protocol_has_them() -> No
         count=5, confidence=1.0, source="", centre=(0, 0, 0), radius=1,
     )  # fmt: skip
     assert json.loads(msgspec.json.encode(row))["class"] == "cup"
+
+
+def test_the_same_camera_is_the_same_object() -> None:
+    given = json_camera()
+    one = messages.ViewCamera(**given).camera()
+    assert messages.DrawRequest(id=3, **given).camera() is one
+    for name, value in {"width": 97, "height": 73, "focal": 91.0}.items():
+        other = messages.ViewCamera(**(given | {name: value})).camera()
+        assert other is not one
+        assert (other.width, other.height, other.fx) == tuple(
+            (given | {name: value})[key] for key in ("width", "height", "focal")
+        )

@@ -397,6 +397,7 @@ def test_a_hint_is_where_the_selection_is_unsure(session, ids) -> None:
     assert session.hint() is None
     values = np.where(ids == 1, 255, np.where(ids == 2, 120, 0)).astype(np.uint8)
     session.do(Select(session.masks.put(values)))
+    assert session.hint(stop=lambda: True) is None
     hint = session.hint()
     assert hint is not None
     x, y, view = hint

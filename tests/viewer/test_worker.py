@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 from splatseg.errors import InputError
 from splatseg.viewer import _guard as guard
@@ -366,3 +367,22 @@ def test_steps_of_what_is_answered_meanwhile_are_not_the_jobs(worker, noted) -> 
     assert ("job", 7) in settled(worker, noted)
     assert [one for one in said if '"progress"' in one and '"done":99' in one] == []
     assert sum('"progress"' in one for one in said) == 3
+
+
+def test_what_is_done_in_idle_is_told_of_what_waits(worker, noted) -> None:
+    client = joined(worker)
+    held(worker, noted, client)
+    assert not worker.is_asked
+    worker.give(client, camera(1))
+    assert worker.is_asked
+    client.busy = True  # the picture before it has not gone out
+    assert not worker.is_asked
+    worker.give(client, select(1))
+    assert worker.is_asked
+    client.busy = False
+    settled(worker, noted)
+    assert not worker.is_asked
+
+
+def test_torch_has_one_thread_in_the_worker(worker) -> None:
+    assert worker.call(lambda _: torch.get_num_threads()).result(10) == 1

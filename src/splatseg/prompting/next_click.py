@@ -19,7 +19,7 @@ of all views is asked for, at its pixel farthest from its rim (Sofiiuk et al., R
 Training with Mask Guidance for Interactive Segmentation, 2021).
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, cast
 
@@ -95,6 +95,7 @@ def next_click(
     clicked: Selection | None = None,
     rejected: Selection | None = None,
     backend: str = "auto",
+    stop: Callable[[], bool] | None = None,
 ) -> NextClick | None:
     """The pixel where a click would settle most.
 
@@ -107,9 +108,10 @@ def next_click(
         rejected: Gaussians that negative prompts pointed at. Of a hole or a detached region that
             shows one of either was asked already, so it is not asked again.
         backend: Name of the rendering backend.
+        stop: Is asked before each view whether something more urgent waits.
 
     Returns:
-        The click, or None where nothing is uncertain.
+        The click, or None where nothing is uncertain, or it was stopped.
     """
     if not views:
         raise InputError("views: expected at least one that may be clicked in, got none.")
@@ -131,6 +133,8 @@ def next_click(
     doubtful = torch.where(likely, doubtful, 0.0)
     shown = gaussians[torch.nonzero(likely).squeeze(1)]
     for view in choose_views(gaussians, views, doubtful, most=_MAX_VIEWS):
+        if stop is not None and stop():
+            return None
         window = _window(view, shown)
         if window is None:
             continue

@@ -97,6 +97,7 @@ class SelectionSession:
         prompter: Turns points and boxes into masks of their views, such as SAM; None leaves them.
         layers: Layers at hand; others are read from the scene's folder.
         neighbours: Neighbours of the scene's Gaussians, to share; None finds them when needed.
+        views: Prepared views of the scene's Gaussians, to share; None prepares them.
         backend: Rendering backend.
         observer: Is told of what is opened.
     """
@@ -111,6 +112,7 @@ class SelectionSession:
         prompter: PromptableMasks | None = None,
         layers: Mapping[str, Layer] | None = None,
         neighbours: SceneIndex | None = None,
+        views: ViewCache | None = None,
         backend: BackendName = "auto",
         observer: Observer = SILENT,
     ) -> None:
@@ -118,7 +120,7 @@ class SelectionSession:
         self._options = options or SelectOptions()
         self._options.level  # noqa: B018  (an error before anything is opened)
         self._prompter = prompter
-        self._views = ViewCache(scene.gaussians, backend=backend)
+        self._views = ViewCache(scene.gaussians, backend=backend) if views is None else views
         self._neighbours = neighbours or SceneIndex(scene.gaussians)
         self._opened = (
             None if source is None else OpenedSource(source=source, name=type(source).__name__)
@@ -334,6 +336,7 @@ def open_selector(
     prompter: PromptableMasks | None = None,
     layers: Mapping[str, Layer] | None = None,
     neighbours: SceneIndex | None = None,
+    views: ViewCache | None = None,
     backend: BackendName = "auto",
     observer: Observer = SILENT,
 ) -> SelectionSession:
@@ -351,6 +354,7 @@ def open_selector(
         prompter=prompter,
         layers=layers,
         neighbours=neighbours,
+        views=views,
         backend=backend,
         observer=observer,
     )

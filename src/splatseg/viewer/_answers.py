@@ -121,6 +121,7 @@ class SceneAnswers:
     def close(self) -> None:
         """Save and release."""
         self._session.close()
+        self._pictures.close()
         self._drawer.close()
 
     def prepare(self) -> None:
@@ -232,7 +233,7 @@ class SceneAnswers:
                 _memory(client).gesture = None
                 self._session.redo(author=client.author)
             case messages.DepthRequest():
-                found = self._drawer.depth(message.camera.camera(), message.x, message.y)
+                found = self._pictures.drawer.depth(message.camera.camera(), message.x, message.y)
                 point = None if found is None else [float(value) for value in found]
                 client.send(messages.PointAnswer(gesture=message.gesture, point=point))
             case messages.Hello():
@@ -241,9 +242,18 @@ class SceneAnswers:
                 raise InputError("message: expected one that has an answer.")
 
     def hint(self, client: Client) -> None:
-        """Say where the next click would help."""
-        document = self._session.document
-        found = None if document.selection is None else self._session.hint(document.selection)
+        """Say where the next click would help; nothing, if something is asked meanwhile."""
+        selection = self._session.document.selection
+        given_up: list[bool] = []
+
+        def stop() -> bool:
+            if self._worker.is_asked:
+                given_up.append(True)
+            return bool(given_up)
+
+        found = None if selection is None else self._session.hint(selection, stop=stop)
+        if given_up:
+            return
         if found is None:
             client.send(messages.HintAnswer())
             return
@@ -299,7 +309,8 @@ class SceneAnswers:
                 words = request.text if request.kind == "words" else ""
                 memory.words = words or memory.words
                 session.select(
-                    words or prompts_of(request, session.scene, self._drawer, session.selected),
+                    words
+                    or prompts_of(request, session.scene, self._pictures.drawer, session.selected),
                     mode=request.mode,
                     level=request.level,
                     base=memory.base,
@@ -487,7 +498,7 @@ def opener(
             root = session.scene.root
             return SceneAnswers(
                 session,
-                Drawer(session.scene, backend=backend),
+                Drawer(session.scene, backend=backend, views=session.views),
                 worker=worker,
                 relay=relay,
                 name="scene" if root is None else root.resolve().name,

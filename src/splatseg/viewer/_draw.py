@@ -11,8 +11,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from splatseg.core import Camera, Features, Gaussians, Scene
+from splatseg.core import Camera, Features, Gaussians, Scene, View
 from splatseg.errors import InputError, RangeError, ShapeError
+from splatseg.prompting.seen import ViewCache
 from splatseg.render import BackendName, PreparedView, SparseSignal, prepare
 from splatseg.viewer._pace import Pace as Pace
 from splatseg.viewer._tint import (
@@ -42,6 +43,7 @@ _SMALLEST = 16
 _PHOTOGRAPH_QUALITY = 85
 _MIN_ALPHA = 0.5
 _IDS = 1 << 16
+_NO_NAME = "page"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,10 +60,14 @@ class Drawer:
     Args:
         scene: The scene.
         backend: Rendering backend.
+        views: Where views of full size are prepared, to share; None keeps the last one alone.
     """
 
-    def __init__(self, scene: Scene, *, backend: BackendName = "auto") -> None:
+    def __init__(
+        self, scene: Scene, *, backend: BackendName = "auto", views: ViewCache | None = None
+    ) -> None:
         self._scene = scene
+        self._views = views
         self._backend: BackendName = backend
         self._view: PreparedView | None = None
         self._key: object = None
@@ -69,6 +75,11 @@ class Drawer:
         self._owned: tuple[Objects, NDArray[np.int32], NDArray[np.uint8]] | None = None
         self._components: Tint | None = None
         self._photographs: OrderedDict[tuple[str, int], bytes] = OrderedDict()
+
+    @property
+    def backend(self) -> BackendName:
+        """The rendering backend."""
+        return self._backend
 
     def close(self) -> None:
         """Release the last view."""
@@ -120,7 +131,7 @@ class Drawer:
         self._check("shown", shown, np.bool_)
         for mask, _ in objects:
             self._check("objects", mask, np.uint8, np.bool_)
-        view = self._prepared(scaled(camera, scale), shown)
+        view = self._prepared(scaled(camera, scale), shown, share=scale == 1)
         if mode == "objects":
             rgb = self._with_selection(view, self._drawn_objects(view, objects), selection)
         elif mode == "depth":
@@ -235,9 +246,13 @@ class Drawer:
             expected = " or ".join(np.dtype(kind).name for kind in types)
             raise InputError(f"{name}: expected {expected}, got {values.dtype}.")
 
-    def _prepared(self, camera: Camera, shown: NDArray[np.bool_] | None) -> PreparedView:
+    def _prepared(
+        self, camera: Camera, shown: NDArray[np.bool_] | None, *, share: bool = True
+    ) -> PreparedView:
         """The view of a camera, the last one where it is the same."""
         hidden = None if shown is None or bool(shown.all()) else shown.tobytes()
+        if hidden is None and share and self._views is not None:
+            return self._views.prepared(View(name=_NO_NAME, camera=camera))
         pose = tuple(camera.cam_from_world.flatten().tolist())
         lens = (camera.fx, camera.fy, camera.cx, camera.cy, camera.model, camera.distortion)
         key = (camera.width, camera.height, lens, pose, hidden)

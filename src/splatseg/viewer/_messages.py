@@ -6,6 +6,7 @@ that are not declared are refused. Cameras have OpenCV axes, and ``matrix`` is w
 row by row.
 """
 
+import functools
 import math
 from typing import Annotated, Any, Literal, TypeAlias, cast
 
@@ -112,22 +113,28 @@ class ViewCamera(_Incoming, kw_only=True):
             raise ValueError("expected a rigid matrix, a rotation and a translation")
 
     def camera(self) -> Camera:
-        """The camera of the renderer."""
-        rows = np.array(self.matrix).reshape(4, 4)
-        # The nearest rotation: what came may have been through float32.
-        left, _, right = np.linalg.svd(rows[:3, :3])
-        cam_from_world = np.eye(4)
-        cam_from_world[:3, :3] = (left @ right).T
-        cam_from_world[:3, 3] = -(left @ right).T @ rows[:3, 3]
-        return Camera(
-            width=self.width,
-            height=self.height,
-            fx=self.focal,
-            fy=self.focal,
-            cx=self.width / 2,
-            cy=self.height / 2,
-            cam_from_world=torch.from_numpy(cam_from_world),
-        )
+        """The camera of the renderer; the same object while it is the same camera."""
+        return _camera(self.width, self.height, self.focal, tuple(self.matrix))
+
+
+@functools.lru_cache(maxsize=16)
+def _camera(width: int, height: int, focal: float, matrix: tuple[float, ...]) -> Camera:
+    """A camera of the renderer. What is prepared for one is found by the object that it is."""
+    rows = np.array(matrix).reshape(4, 4)
+    # The nearest rotation: what came may have been through float32.
+    left, _, right = np.linalg.svd(rows[:3, :3])
+    cam_from_world = np.eye(4)
+    cam_from_world[:3, :3] = (left @ right).T
+    cam_from_world[:3, 3] = -(left @ right).T @ rows[:3, 3]
+    return Camera(
+        width=width,
+        height=height,
+        fx=focal,
+        fy=focal,
+        cx=width / 2,
+        cy=height / 2,
+        cam_from_world=torch.from_numpy(cam_from_world),
+    )
 
 
 class Hello(_Incoming, kw_only=True, tag_field="type", tag="hello"):

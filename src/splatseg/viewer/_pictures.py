@@ -1,11 +1,15 @@
 """Pictures of a session's document: what is shown of it, and in which colours."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
 import numpy as np
 from numpy.typing import NDArray
 
 from splatseg.core import Camera
 from splatseg.viewer import _messages as messages
-from splatseg.viewer._document import MEMBER, Confidence, Document
+from splatseg.viewer._document import MEMBER, Confidence, Document, Edit
 from splatseg.viewer._draw import Drawer, Picture
 from splatseg.viewer._session import Session
 
@@ -13,6 +17,14 @@ _MAX_OBJECT = 32766
 _FIRST_SUGGESTION = 32768
 _FIRST_THING = 49152
 """From here on an id of an id map is a thing that a click would select: it has an outline alone."""
+
+
+Number = TypeVar("Number", bound=np.generic)
+
+
+def changes_rows(edits: Sequence[Edit]) -> bool:
+    """Whether edits draw other Gaussians than the scene has; what is removed is left out alone."""
+    return any(edit.kind != "remove" for edit in edits)
 
 
 class Pictures:
@@ -25,8 +37,28 @@ class Pictures:
 
     def __init__(self, session: Session, drawer: Drawer) -> None:
         self._session = session
-        self._drawer = drawer
+        self._scene_drawer = drawer
+        self._edited: tuple[tuple[Edit, ...], Drawer] | None = None
         self._kept: _Look | None = None
+        self._last: _Drawn | None = None
+
+    @property
+    def drawer(self) -> Drawer:
+        """Draws the scene as its edits make it: what was moved is where it was moved to."""
+        edits = self._session.document.edits
+        if not changes_rows(edits):
+            return self._scene_drawer
+        if self._edited is None or self._edited[0] != edits:
+            self.close()
+            scene = self._session.edited_scene()
+            self._edited = edits, Drawer(scene, backend=self._scene_drawer.backend)
+        return self._edited[1]
+
+    def close(self) -> None:
+        """Release what draws edits."""
+        if self._edited is not None:
+            self._edited[1].close()
+        self._edited = None
 
     @property
     def selection(self) -> Confidence | None:
@@ -53,19 +85,34 @@ class Pictures:
             scale: Share of the camera's pixels.
         """
         wants_objects = request.mode in ("objects", "blend")
-        return self._drawer.picture(
+        similarity = self._similarity(words) if request.mode == "similarity" else None
+        look = self._look
+        return self.drawer.picture(
             camera,
             mode=request.mode,
-            selection=selection,
-            objects=self._look.objects if wants_objects else (),
+            selection=None if selection is None else look.drawn(selection),
+            objects=look.objects if wants_objects else (),
             shown=self._shown(request),
-            similarity=self._similarity(words) if request.mode == "similarity" else None,
+            similarity=None if similarity is None else look.drawn(similarity),
             scale=scale,
         )
 
     def id_map(self, request: messages.DrawRequest) -> NDArray[np.uint16]:
-        """The object or suggestion at each pixel, as the protocol has it."""
-        return self._drawer.id_map(request.camera(), self._look.ids, shown=self._shown(request))
+        """The object or suggestion at each pixel, as the protocol has it.
+
+        A selection changes nothing of it: it is drawn once for a camera and what there is.
+        """
+        camera, ids, shown = request.camera(), self._look.ids, self._shown(request)
+        last = self._last
+        if (
+            last is None
+            or last.camera is not camera
+            or last.ids is not ids
+            or not np.array_equal(last.shown, shown)
+        ):
+            drawn = self.drawer.id_map(camera, ids, shown=shown)
+            self._last = last = _Drawn(camera=camera, ids=ids, shown=shown, drawn=drawn)
+        return last.drawn
 
     @property
     def _look(self) -> "_Look":
@@ -78,13 +125,24 @@ class Pictures:
         only = request.only if isinstance(request, messages.DrawRequest) else None
         if only is None:
             return self._look.shown
-        return self._session.confidence(self._session.document.object(only).mask) >= MEMBER
+        members = self._session.confidence(self._session.document.object(only).mask) >= MEMBER
+        return self._look.drawn(members)
 
     def _similarity(self, words: str) -> NDArray[np.float32] | None:
         if words:
             return self._session.similarity(words)
         selection = self.selection
         return None if selection is None else np.divide(selection, 255, dtype=np.float32)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Drawn:
+    """The last id map, and what it was drawn of."""
+
+    camera: Camera
+    ids: NDArray[np.int32]
+    shown: NDArray[np.bool_]
+    drawn: NDArray[np.uint16]
 
 
 class _Look:
@@ -95,30 +153,41 @@ class _Look:
         self.revision = document.revision
         self._session = session
         self._document = document
-        self.shown: NDArray[np.bool_] = session.visible
+        self._rows = session.edited_rows() if changes_rows(document.edits) else None
+        self.shown: NDArray[np.bool_] = self.drawn(session.visible)
         self._owners: NDArray[np.int32] | None = None
         self._ids: NDArray[np.int32] | None = None
+        self._objects: list[tuple[NDArray[np.bool_], tuple[int, int, int]]] | None = None
         self._things: NDArray[np.int32] | None = None
         if before is not None and before.same_objects(document):
             self._owners, self._ids, self._things = before._owners, before._ids, before._things
+            self._objects = before._objects
+
+    def drawn(self, values: NDArray[Number]) -> NDArray[Number]:
+        """Values of the scene's Gaussians as those of the Gaussians that are drawn."""
+        return values if self._rows is None else values[self._rows]
 
     def same_objects(self, document: Document) -> bool:
-        """Whether a document has the same objects and suggestions."""
+        """Whether a document has the same objects, suggestions and edits."""
         mine = self._document
-        return mine.objects == document.objects and mine.suggestions == document.suggestions
+        return (mine.objects, mine.suggestions, mine.edits) == (
+            document.objects, document.suggestions, document.edits,
+        )  # fmt: skip
 
     @property
     def owners(self) -> NDArray[np.int32]:
         """The object of each Gaussian, -1 for none."""
         if self._owners is None:
-            self._owners = self._session.owners()
+            self._owners = self.drawn(self._session.owners())
         return self._owners
 
     @property
     def objects(self) -> list[tuple[NDArray[np.bool_], tuple[int, int, int]]]:
-        """Which Gaussians each object has, and its colour."""
-        owners = self.owners
-        return [(owners == one.id, one.colour) for one in self._document.objects]
+        """Which Gaussians each object has, and its colour; the same list while they are."""
+        if self._objects is None:
+            owners = self.owners
+            self._objects = [(owners == one.id, one.colour) for one in self._document.objects]
+        return self._objects
 
     @property
     def ids(self) -> NDArray[np.int32]:
@@ -126,14 +195,14 @@ class _Look:
         things = self._session.things
         if self._ids is None or self._things is not things:
             self._things = things
-            owners = self.owners
+            things, owners = self.drawn(things), self.owners
             ids = np.where(owners <= _MAX_OBJECT, owners + 1, 0).astype(np.int32)
             last = np.iinfo(np.uint16).max - _FIRST_THING
             known = (things >= 0) & (things <= last) & (owners < 0)
             ids[known] = _FIRST_THING + things[known]
             for one in self._document.suggestions:
                 if one.id < _FIRST_THING - _FIRST_SUGGESTION:
-                    member = self._session.confidence(one.mask) >= MEMBER
+                    member = self.drawn(self._session.confidence(one.mask)) >= MEMBER
                     ids[member & (owners < 0)] = _FIRST_SUGGESTION + one.id
             self._ids = ids
         return self._ids

@@ -31,7 +31,7 @@ from splatseg.errors import InputError
 from splatseg.prompting.next_click import next_click
 from splatseg.prompting.pipeline import SceneIndex
 from splatseg.prompting.prompts import AxisBox, Ball, Lasso, SelectionPrompt, ViewPrompt
-from splatseg.prompting.seen import VisiblePrompt
+from splatseg.prompting.seen import ViewCache, VisiblePrompt
 from splatseg.render import BackendName
 from splatseg.selection import pieces
 from splatseg.tasks.query import QuerySession
@@ -172,12 +172,12 @@ class Selecting:
         self._work = Work(scene=scene, backend=backend, observer=observer)
         self._things: NDArray[np.int32] | None = None
         self.neighbours = SceneIndex(scene.gaussians)
+        self.views = ViewCache(scene.gaussians, backend=backend)
         self.seconds: Mapping[str, float] = {}
 
     def close(self) -> None:
         """Release what it holds; it is opened again when it is needed."""
-        if self._selector is not None:
-            self._selector.close()
+        self.views.close()
         self._selector, self._words, self._chosen, self._things = None, None, None, None
         self._work = Work(scene=self._scene, backend=self._backend, observer=self._observer)
 
@@ -295,12 +295,16 @@ class Selecting:
         """
         return self._asked().ask([words]).probabilities[:, 0].float().cpu()
 
-    def hint(self, confidence: Float[Tensor, "n"]) -> tuple[float, float, str] | None:
+    def hint(
+        self, confidence: Float[Tensor, "n"], *, stop: Callable[[], bool] | None
+    ) -> tuple[float, float, str] | None:
         """Column and row in a view where a click would help most, and its name."""
         views = self._scene.train_views or self._scene.views
         if not views:
             return None
-        found = next_click(self._scene.gaussians, views, confidence, backend=self._backend)
+        found = next_click(
+            self._scene.gaussians, views, confidence, backend=self._backend, stop=stop
+        )
         return None if found is None else (*found.point, found.view.name)
 
     def _records(self, prompts: Sequence[SelectionPrompt], level: float | None) -> list[Any]:
@@ -351,6 +355,7 @@ class Selecting:
                 options=self._options(),
                 source=own,
                 neighbours=self.neighbours,
+                views=self.views,
                 backend=self._backend,
                 observer=self._observer,
             )

@@ -67,6 +67,7 @@ class ViewServer:
         self._logins = guard.Rate(guard.LOGINS_A_MINUTE, seconds=60)
         self._server: Any = None
         self._thread: threading.Thread | None = None
+        self._ended = threading.Event()
 
     @property
     def url(self) -> str:
@@ -108,7 +109,7 @@ class ViewServer:
             )
         )
         self._thread = threading.Thread(
-            target=lambda: asyncio.run(self._server.serve(sockets=[self._listening])),
+            target=self._serve,
             name="splatseg view: server",
             daemon=True,
         )
@@ -126,8 +127,16 @@ class ViewServer:
 
     def wait(self) -> None:
         """Until it ends, or is interrupted."""
-        while self._thread is not None and self._thread.is_alive():
-            self._thread.join(timeout=3600)
+        # Not by `join`: in Python 3.11, one that Ctrl-C interrupts takes the thread for ended.
+        while self._thread is not None and not self._ended.wait(timeout=3600):
+            pass
+
+    def _serve(self) -> None:
+        if self._server is not None:
+            try:
+                asyncio.run(self._server.serve(sockets=[self._listening]))
+            finally:
+                self._ended.set()
 
     def _application(self) -> Any:
         from starlette.applications import Starlette

@@ -30,6 +30,7 @@ from splatseg.io.scene import load_scene
 from splatseg.io.scene_folder import scene_path
 from splatseg.io.splats import WritableFormat, read_splats
 from splatseg.prompting.prompts import AxisBox, Ball, Lasso, SelectionPrompt, Similar, ViewPrompt
+from splatseg.prompting.seen import ViewCache
 from splatseg.render import BackendName
 from splatseg.tasks.work import SILENT, Observer
 from splatseg.viewer import _products as products
@@ -193,6 +194,11 @@ class Session:
         return self._selecting.source
 
     @property
+    def views(self) -> ViewCache:
+        """Views that are prepared for selecting; whoever draws may share them."""
+        return self._selecting.views
+
+    @property
     def words(self) -> bool:
         """Whether the scene has a layer that answers words."""
         return self._selecting.words is not None
@@ -346,19 +352,24 @@ class Session:
         """
         return self._selecting.similarity(words).numpy()
 
-    def hint(self, selection: Mask | None = None) -> tuple[float, float, str] | None:
+    def hint(
+        self, selection: Mask | None = None, *, stop: Callable[[], bool] | None = None
+    ) -> tuple[float, float, str] | None:
         """Where the next click would help most: x and y in pixels of a view, and its name.
 
         Args:
             selection: Of what; None takes the present selection.
+            stop: Is asked now and then whether to give it up.
 
         Returns:
-            None where nothing is selected, nothing is uncertain, or the scene has no views.
+            None where it was given up, nothing is selected, nothing is uncertain, or the scene has
+            no views.
         """
         mask = selection or self.document.selection
         if mask is None:
             return None
-        return self._selecting.hint(torch.from_numpy(np.array(self.confidence(mask))) / 255)
+        confidence = torch.from_numpy(np.array(self.confidence(mask))) / 255
+        return self._selecting.hint(confidence, stop=stop)
 
     def grow(self, factor: float = 1.0, *, author: str = "") -> Document:
         """Add what is near to the selection.

@@ -14,6 +14,7 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias, TypeVar
 
+from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError, SplatsegError
 from splatseg.viewer import _guard as guard
 from splatseg.viewer import _messages as messages
@@ -316,6 +317,16 @@ class Worker:
 
     # In the thread.
 
+    @property
+    def is_asked(self) -> bool:
+        """Whether a picture, a call or an answer waits; what is done in idle ends for it."""
+        with self._changed:
+            drawing = any(
+                client.waiting_camera is not None and not client.busy
+                for client in self._clients.values()
+            )
+            return drawing or bool(self._calls or self._tasks or self._jobs) or self.closing
+
     def redraw(self, author: str = "") -> None:
         """Draw the last camera of every page again, at rest: the document changed.
 
@@ -381,6 +392,11 @@ class Worker:
             client.send(messages.Error(text=text, **about))  # pyright: ignore[reportArgumentType]
 
     def _run(self) -> None:
+        # Torch's threads would spin on the cores that the kernels and the browser need.
+        with one_torch_thread():
+            self._work()
+
+    def _work(self) -> None:
         try:
             self._answers = self._open(self)
         except BaseException as error:  # noqa: BLE001  (`start` raises it in its thread)

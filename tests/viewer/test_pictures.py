@@ -1,0 +1,87 @@
+"""What pictures of a document are drawn from is made once."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from splatseg.viewer import Session, open_session
+from splatseg.viewer import _messages as messages
+from splatseg.viewer._pictures import Pictures
+from splatseg.viewer.commands import Keep, Select, SetVisible
+from support.viewer import EACH, json_camera
+
+
+class Counting:
+    """A drawer that notes what it is given, and draws ids as one row of pixels."""
+
+    def __init__(self) -> None:
+        self.objects: list[Any] = []
+        self.maps = 0
+
+    def picture(self, camera: Any, *, objects: Any, **_: Any) -> None:
+        self.objects.append(objects)
+
+    def id_map(self, camera: Any, ids: Any, *, shown: Any) -> Any:
+        self.maps += 1
+        return np.where(shown, ids, 0)[None].astype(np.uint16)
+
+
+@pytest.fixture
+def session(things) -> Iterator[Session]:
+    with open_session(things, backend="cpu") as opened:
+        yield opened
+
+
+def select(session: Session, thing: int) -> None:
+    values = np.zeros(3 * EACH, dtype=np.uint8)
+    values[thing * EACH : (thing + 1) * EACH] = 255
+    session.do(Select(session.masks.put(values)))
+
+
+def request(**more: Any) -> messages.DrawRequest:
+    return messages.DrawRequest(id=1, mode="objects", rest=True, **(json_camera() | more))
+
+
+def test_objects_are_listed_once_while_they_are_the_same(session) -> None:
+    drawer = Counting()
+    pictures = Pictures(session, drawer)  # pyright: ignore[reportArgumentType]
+
+    def drawn() -> Any:
+        asked = request()
+        pictures.picture(asked, asked.camera(), selection=None)
+        return drawer.objects[-1]
+
+    select(session, 0)
+    session.do(Keep("red"))
+    first = drawn()
+    assert [colour for _, colour in first] == [session.document.objects[0].colour]
+    assert first[0][0].sum() == EACH
+    assert drawn() is first
+    select(session, 1)
+    assert drawn() is first
+    session.do(Keep("blue"))
+    second = drawn()
+    assert [mask.nonzero()[0][0] for mask, _ in second] == [0, EACH]
+    session.undo()
+    assert len(drawn()) == 1
+
+
+def test_an_id_map_is_drawn_once_of_what_it_shows(session) -> None:
+    drawer = Counting()
+    pictures = Pictures(session, drawer)  # pyright: ignore[reportArgumentType]
+    select(session, 0)
+    assert not pictures.id_map(request()).any()
+    session.do(Keep("red"))
+    first = pictures.id_map(request())
+    assert (first > 0).sum() == EACH
+    assert drawer.maps == 2
+    select(session, 1)
+    assert pictures.id_map(request()) is first
+    assert drawer.maps == 2
+    pictures.id_map(request(focal=91.0))
+    assert drawer.maps == 3
+    session.do(SetVisible((session.document.objects[0].id,), visible=False))
+    assert not pictures.id_map(request(focal=91.0)).any()
+    assert drawer.maps == 4
