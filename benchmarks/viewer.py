@@ -193,8 +193,8 @@ def report(made: dict[str, Any]) -> list[str]:
         f"orbit: {turned['frames_a_second']:.1f} frames/s, width {turned['share']:.2f} of the "
         f"canvas (least {turned['least_share']:.2f}); input to paint "
         f"{percentiles(turned['input_to_paint'])}; camera to paint "
-        f"{percentiles(turned['camera_to_paint'])}; {turned['moves_a_second']:.0f} moves/s; draw {percentiles(turned['draw'])}; encode "
-        f"{percentiles(turned['encode'])}",
+        f"{percentiles(turned['camera_to_paint'])}; {turned['moves_a_second']:.0f} moves/s; "
+        f"draw {percentiles(turned['draw'])}; encode {percentiles(turned['encode'])}",
     ]
     if "clicks" not in made:
         return lines
