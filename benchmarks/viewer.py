@@ -5,9 +5,9 @@
 The scene needs a layer that answers clicks (`splatseg segment SCENE --method associate`). It is
 served by `splatseg view` from a copy whose journal is empty, and shown on a canvas of 720 x 600.
 
-- `orbit`: 8 s of dragging, 30 moves a second. Frames a second, the share of the canvas' width
-  that they are drawn with, and from the last move of the pointer that a camera holds (what the page
-  sends it for) to the picture of it on the canvas.
+- `orbit`: 8 s of dragging. Frames a second, the share of the canvas' width that they are drawn
+  with, and from the first move of the pointer that no camera had gone out for to the picture that
+  shows it; also from the camera's going out to the picture.
 - `click`: a grid of clicks in several photographs' cameras, one after the other has been answered,
   from the end of the press to the first tinted picture, and to the cleaned one. What has fewer than
   5 000 Gaussians is apart from what has more (floors, walls).
@@ -70,16 +70,25 @@ def orbit(viewer: Viewer, seconds: float) -> dict[str, Any]:
     while (spent := time.perf_counter() - began) < seconds:
         angle = 2 * math.pi * spent / 4
         page.mouse.move(*viewer.at(0.5 + 0.2 * math.sin(angle), 0.5 + 0.04 * math.cos(angle)))
-        page.wait_for_timeout(25)
+        page.wait_for_timeout(8)
     frames = [one for one in viewer.seen("frames") if not one["rest"]]
+    sent = [one for one in viewer.seen("sent") if one["type"] == "camera" and one["input"]]
+    moves = len(viewer.seen("moves")) / seconds
     page.mouse.up()
     viewer.settle()
+    waited: list[float] = []
+    for one in frames:
+        asked = [other for other in sent if other["at"] <= one["startTime"]]
+        if asked and one["startTime"] - asked[-1]["at"] < 1:
+            waited.append(one["startTime"] + one["duration"] - asked[-1]["input"])
     spans = np.diff([one["startTime"] + one["duration"] for one in frames])
     return {
         "frames_a_second": len(spans) / max(1e-3 * float(spans.sum()), 1e-9),
         "share": float(np.median([one["width"] for one in frames])) / WIDTH,
         "least_share": min(one["width"] for one in frames) / WIDTH,
-        "input_to_paint": [one["duration"] for one in frames],
+        "moves_a_second": moves,
+        "input_to_paint": waited,
+        "camera_to_paint": [one["duration"] for one in frames],
         "draw": [one["draw"] for one in frames],
         "encode": [one["encode"] for one in frames],
     }
@@ -182,9 +191,10 @@ def report(made: dict[str, Any]) -> list[str]:
     lines = [
         f"load {made['load']:.1f} to {made['load_after']:.1f}; ready after {made['ready']:.1f} s",
         f"orbit: {turned['frames_a_second']:.1f} frames/s, width {turned['share']:.2f} of the "
-        f"canvas (least {turned['least_share']:.2f}); camera to paint "
-        f"{percentiles(turned['input_to_paint'])}; draw {percentiles(turned['draw'])}; encode "
-        f"{percentiles(turned['encode'])}",
+        f"canvas (least {turned['least_share']:.2f}); input to paint "
+        f"{percentiles(turned['input_to_paint'])}; camera to paint "
+        f"{percentiles(turned['camera_to_paint'])}; {turned['moves_a_second']:.0f} moves/s; "
+        f"draw {percentiles(turned['draw'])}; encode {percentiles(turned['encode'])}",
     ]
     if "clicks" not in made:
         return lines

@@ -26,7 +26,7 @@ WIDTH, HEIGHT = 720, 600
 
 _WATCH = """
 (() => {
-  const seen = { sent: [], came: [], painted: [], up: [], frames: [] };
+  const seen = { sent: [], came: [], painted: [], up: [], frames: [], moves: [], input: null };
   window.seen = seen;
   const send = WebSocket.prototype.send;
   WebSocket.prototype.send = function (data) {
@@ -46,7 +46,9 @@ _WATCH = """
     }
     const message = JSON.parse(data);
     const { type, focal, width, height, rest } = message;
-    seen.sent.push({ at: performance.now(), type, focal, width, height, rest });
+    const at = performance.now();
+    seen.sent.push({ at, type, focal, width, height, rest, input: seen.input });
+    if (type === "camera") seen.input = null;
     return send.call(this, data);
   };
   const draw = CanvasRenderingContext2D.prototype.drawImage;
@@ -56,10 +58,13 @@ _WATCH = """
     return drawn;
   };
   addEventListener("pointerup", (event) => seen.up.push(event.timeStamp), true);
-  addEventListener("pointermove", (event) => (seen.moved = event.timeStamp), true);
+  addEventListener("pointermove", (event) => {
+    seen.input ??= event.timeStamp; // the first that no camera has gone out for
+    seen.moves.push(event.timeStamp);
+  }, true);
   new PerformanceObserver((list) => {
     for (const { name, startTime, duration, detail } of list.getEntries())
-      if (name === "frame") seen.frames.push({ startTime, duration, ...detail, at: seen.moved });
+      if (name === "frame") seen.frames.push({ startTime, duration, ...detail });
   }).observe({ entryTypes: ["measure"] });
 })();
 """
@@ -170,7 +175,7 @@ class Viewer:
     def forget(self) -> None:
         """Begin to write down anew."""
         self.page.evaluate(
-            "Object.assign(seen, {sent: [], came: [], painted: [], up: [], frames: []})"
+            "Object.assign(seen, {sent: [], came: [], painted: [], up: [], frames: [], moves: []})"
         )
 
     def await_type(self, kind: str, *, seconds: float = 120, stage: str | None = None) -> Any:
