@@ -8,8 +8,11 @@ import pytest
 
 from splatseg.viewer import Session, open_session
 from splatseg.viewer import _messages as messages
+from splatseg.viewer._document import Edit
+from splatseg.viewer._draw import Drawer
+from splatseg.viewer._pictures import _FIRST_THING as FIRST_THING
 from splatseg.viewer._pictures import Pictures
-from splatseg.viewer.commands import Keep, Select, SetVisible
+from splatseg.viewer.commands import Apply, Keep, Select, SetVisible
 from support.viewer import EACH, json_camera
 
 
@@ -41,7 +44,7 @@ def select(session: Session, thing: int) -> None:
 
 
 def request(**more: Any) -> messages.DrawRequest:
-    return messages.DrawRequest(id=1, mode="objects", rest=True, **(json_camera() | more))
+    return messages.DrawRequest(id=1, rest=True, **(json_camera() | {"mode": "objects"} | more))
 
 
 def test_objects_are_listed_once_while_they_are_the_same(session) -> None:
@@ -72,10 +75,10 @@ def test_an_id_map_is_drawn_once_of_what_it_shows(session) -> None:
     drawer = Counting()
     pictures = Pictures(session, drawer)  # pyright: ignore[reportArgumentType]
     select(session, 0)
-    assert not pictures.id_map(request()).any()
+    assert (pictures.id_map(request()) >= FIRST_THING).all(), "things have outlines alone"
     session.do(Keep("red"))
     first = pictures.id_map(request())
-    assert (first > 0).sum() == EACH
+    assert (first < FIRST_THING).sum() == EACH
     assert drawer.maps == 2
     select(session, 1)
     assert pictures.id_map(request()) is first
@@ -83,5 +86,31 @@ def test_an_id_map_is_drawn_once_of_what_it_shows(session) -> None:
     pictures.id_map(request(focal=91.0))
     assert drawer.maps == 3
     session.do(SetVisible((session.document.objects[0].id,), visible=False))
-    assert not pictures.id_map(request(focal=91.0)).any()
+    hidden = pictures.id_map(request(focal=91.0))
+    assert (hidden == 0).sum() == EACH
     assert drawer.maps == 4
+
+
+@pytest.mark.parametrize(("kind", "more"), [("move", 0), ("duplicate", EACH), ("recolour", 0)])
+def test_edits_are_drawn(session, kind, more) -> None:
+    pictures = Pictures(session, Drawer(session.scene))
+
+    def drawn() -> Any:
+        asked = request(mode="colour")
+        return pictures.picture(asked, asked.camera(), selection=None).rgb, pictures.id_map(asked)
+
+    select(session, 0)
+    session.do(Keep("red"))
+    before, ids = drawn()
+    mask = session.document.objects[0].mask
+    moved = {} if kind == "recolour" else {"translation": (0.0, 0.0, 0.4)}
+    colour = {"colour": (0, 0, 255)} if kind == "recolour" else {}
+    session.do(Apply(Edit(kind=kind, mask=mask, **moved, **colour)))
+    assert len(session.edited_rows()) == len(session.scene.gaussians) + more
+    after, ids_after = drawn()
+    assert (before != after).any()
+    assert (ids != ids_after).any() == (kind != "recolour")
+    session.undo()
+    again, ids_again = drawn()
+    assert (again == before).all()
+    assert (ids_again == ids).all()
