@@ -466,7 +466,7 @@ def test_there_are_so_many_pages_at_a_time(server) -> None:
 
 
 def test_a_page_that_reads_no_more_is_let_go(server, monkeypatch) -> None:
-    monkeypatch.setattr(_server, "_MAX_WAITING", 5)
+    monkeypatch.setattr(_server, "_MAX_WAITING", 15)  # who reads may be late on a busy machine
     with opened(server), opened(server) as other:
         before = len(server.worker.clients)
         for _ in range(40):

@@ -78,7 +78,7 @@ def meanwhile(monkeypatch: pytest.MonkeyPatch, look: Callable[[Page], None]) -> 
 def ended(process: "subprocess.Popen[str]", number: int = signal.SIGINT) -> tuple[int, str]:
     """The status and the errors of a process that a signal ends."""
     process.send_signal(number)
-    _, errors = process.communicate(timeout=30)
+    _, errors = process.communicate(timeout=120)  # of a machine that does much else
     return process.returncode, errors
 
 

@@ -7,7 +7,7 @@ their content and lie in a store.
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, Protocol, TypeAlias
+from typing import Annotated, Any, Literal, Protocol, TypeAlias, cast
 
 import numpy as np
 from msgspec import Meta
@@ -167,10 +167,20 @@ class Select:
     def __post_init__(self) -> None:
         # As JSON gives it back, so that a replayed command equals this one.
         try:
-            text = json.dumps(self.prompt, allow_nan=False)
+            json.dumps(self.prompt, allow_nan=False)
         except (TypeError, ValueError, RecursionError) as error:
             raise InputError(f"prompt: expected values that JSON holds ({error}).") from error
-        object.__setattr__(self, "prompt", json.loads(text))
+        object.__setattr__(self, "prompt", _as_json(self.prompt))
+
+
+def _as_json(value: Any) -> Any:
+    """A value as JSON gives it back: lists for tuples, text for keys."""
+    if isinstance(value, Mapping):
+        items = cast("Mapping[Any, Any]", value).items()
+        return {str(key): _as_json(one) for key, one in items}
+    if isinstance(value, list | tuple):
+        return [_as_json(one) for one in cast("Sequence[Any]", value)]
+    return value
 
 
 @dataclass(frozen=True, slots=True)
