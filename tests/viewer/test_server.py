@@ -2,17 +2,22 @@
 
 import io
 import json
+import re
+import shutil
+import sys
 import threading
 import time
 import zipfile
+from typing import Any
 
 import httpx
 import numpy as np
 import pytest
+import torch
 from websockets.exceptions import ConnectionClosed
 
 from splatseg.errors import InputError
-from splatseg.io.scene import load_scene
+from splatseg.io.scene import load_scene, save_scene_layer
 from splatseg.viewer._job_process import main
 from splatseg.viewer._server import ViewServer
 from support.viewer import (
@@ -524,12 +529,107 @@ def test_the_process_of_a_job_says_how_far_it_is_and_how_it_ends(things) -> None
     assert status == 0
     assert all(set(line) == {"done", "total", "text"} for line in lines[:-1])
     assert (lines[-2]["done"], lines[-2]["total"]) == (1, 1)
-    assert lines[-1] == {"text": "masks of 1 views by classical"}
-    assert said("associate")[1][-1] == {"text": "layer masks"}
+    assert lines[-1] == {"text": "masks of 1 view by classical"}
+    assert said("see")[1] == [{"text": "masks are at hand"}]
+    assert re.fullmatch(r"\d+ objects? in layer masks", said("associate")[1][-1]["text"])
     assert set(load_scene(things).layers) == {"masks", "things"}
+    # What was made in another way is not replaced, what was associated is.
+    save_scene_layer(load_scene(things).layers["things"], things, "masks")
+    assert said("associate")[1][-1]["text"].endswith(" in layer masks_2")
+    assert said("associate")[1][-1]["text"].endswith(" in layer masks_2")
     status, lines = said("see", model="../masks")
     assert status == 2
     assert "expected one of" in lines[-1]["error"]
+
+
+def test_what_is_at_hand_makes_masks(things, monkeypatch) -> None:
+    from splatseg import models
+    from splatseg.errors import MissingFileError
+    from splatseg.viewer import _job_process
+
+    asked: list[str] = []
+
+    def find(name: str) -> str:
+        asked.append(name)
+        if name == "sam":
+            return "the model"
+        raise MissingFileError("weights: not on this machine.")
+
+    monkeypatch.setattr(models, "find_model", find)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert _job_process._model_at_hand() == "classical"
+    assert asked == []
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    assert _job_process._model_at_hand() == "the model"
+    assert asked == ["sam2", "sam-hq", "sam"]
+
+
+def test_masks_at_hand_cover_all_views_those_of_sam_first(things) -> None:
+    from splatseg.tasks.work import Work
+    from splatseg.viewer._job_process import masks_at_hand
+
+    def at_hand() -> str | None:
+        return masks_at_hand(Work(scene=load_scene(things)))
+
+    assert at_hand() is None
+    main(["see", str(things), "cpu"], io.StringIO("{}"), io.StringIO())
+    assert at_hand() == "masks"
+    shutil.copytree(things / "evidence" / "masks", things / "evidence" / "big_sam")
+    assert at_hand() == "big_sam"
+    for path in (things / "evidence" / "big_sam").glob("first*"):
+        path.unlink()
+    assert at_hand() == "masks"
+
+
+def test_a_job_ends_with_the_server(serving, things, monkeypatch) -> None:
+    from splatseg.viewer import _jobs
+
+    started: list[Any] = []
+    popen = _jobs.subprocess.Popen
+
+    def start(command, **options):
+        started.append(popen([sys.executable, "-c", "import time; time.sleep(600)"], **options))
+        return started[0]
+
+    monkeypatch.setattr(_jobs.subprocess, "Popen", start)
+    server = serving()
+    with opened(server) as page:
+        page.send("job", id=1, name="see")
+        page.still(1)
+        while not started:
+            time.sleep(0.01)
+        began = time.monotonic()
+        server.close()
+    assert time.monotonic() - began < 5
+    assert started[0].poll() is not None, "it does not outlive the server"
+
+
+def test_after_a_layer_was_made_the_first_click_is_prepared(page, monkeypatch) -> None:
+    from splatseg.viewer import _jobs
+    from splatseg.viewer import _messages as messages
+    from splatseg.viewer._session import Session
+
+    prepared: list[int] = []
+    monkeypatch.setattr(Session, "prepare", lambda self: prepared.append(1))
+
+    def begin(job, root, backend, given, done):
+        thread = threading.Thread(target=lambda: done(endings.pop()))
+        thread.start()
+        return thread
+
+    endings: list[Any] = [
+        messages.Finished(id=2, result={}),
+        messages.Error(text="cancelled", id=1),
+    ]
+    monkeypatch.setattr(_jobs, "start_process", begin)
+    page.send("job", id=1, name="associate")
+    assert finished(page, 1)["type"] == "error"
+    page.still(1)
+    assert prepared == []
+    page.send("job", id=2, name="associate")
+    assert finished(page, 2)["type"] == "finished"
+    page.still(2)
+    assert prepared == [1]
 
 
 def test_an_error_in_an_answer_leaves_the_server_running(page, monkeypatch, caplog) -> None:

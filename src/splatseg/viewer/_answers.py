@@ -120,6 +120,7 @@ class SceneAnswers:
 
     def close(self) -> None:
         """Save and release."""
+        self._jobs.close()
         self._session.close()
         self._pictures.close()
         self._drawer.close()

@@ -211,21 +211,26 @@ class Drawer:
         return camera.unproject(torch.tensor([x, y], dtype=torch.float64), depth).numpy()
 
     def photograph(self, name: str, width: int) -> bytes:
-        """The photograph of a view as JPEG; some of them are kept.
+        """The photograph of a view as JPEG, its render where it has none; some of them are kept.
 
         Args:
             name: The view.
             width: Pixels across at most, 16 to 2048.
 
         Raises:
-            InputError: If there is no such view, or it has no photograph.
+            InputError: If there is no such view, or its photograph is gone.
         """
         width = min(max(width, _SMALLEST), _WIDEST)
         key = (name, width)
         if key not in self._photographs:
             view = self._scene.view(name)
-            longest = max(width, round(width * view.camera.height / view.camera.width))
-            image = view.read_image(longest=longest)
+            height = max(1, round(width * view.camera.height / view.camera.width))
+            if view.image is None:
+                camera = view.camera.resized(width, height)
+                with prepare(self._scene.gaussians, camera, backend=self._backend) as drawn:
+                    image = drawn.picture()
+            else:
+                image = view.read_image(longest=max(width, height))
             self._photographs[key] = _jpeg(image.numpy(), _PHOTOGRAPH_QUALITY)
             while len(self._photographs) > 1 and self._photograph_bytes > _PHOTOGRAPHS:
                 self._photographs.popitem(last=False)
