@@ -2,7 +2,7 @@
 
     python benchmarks/viewer_task.py SCENE ../shared/data/toys [--pictures DIR] [--json FILE]
     python benchmarks/viewer_task.py guitar.compressed.ply --pictures DIR \\
-        --places head=0.5,0.1 neck=0.5,0.3+0.5,0.5 ...
+        --places head=0.5,0.1 neck=0.5,0.3+0.5,0.5 stand=0.5,0.9@1 ...
 
 `splatseg view` and a real Chromium, clicks counted. The photograph in which most things are large
 enough is opened by its thumbnail (one click); the five largest things there that cover at most 15 %
@@ -17,8 +17,9 @@ IoU is that of `clicks.py`: the mean over all test views.
 A splat file has neither photographs nor truth: the person presses "Make masks", waits, and clicks
 what the picture shows in the view that the page opens with. `--places` says where, as shares of its
 width and height from the upper left, and what it is; a further place of a thing is clicked with
-Shift. Without it the largest five things of the tree that are seen there are clicked in the middle.
-What came into each file is drawn from two sides, to be judged by eye.
+Shift, and `@` says the size of the thing, 0 part, 0.5 object, 1 group, which keys set. Without it
+the largest five things of the tree that are seen there are clicked in the middle. What came into
+each file is drawn from two sides, to be judged by eye.
 """
 
 import argparse
@@ -26,6 +27,8 @@ import json
 import shutil
 import tempfile
 import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +56,7 @@ EXPORTING = 5
 LARGEST = 0.15
 GOOD = 0.85
 MASKS_SECONDS = 900
+SIDE = 240
 
 
 class Person:
@@ -63,6 +67,7 @@ class Person:
         self.clicks = 0
         self.texts = 0
         self._camera: dict[str, float] = {}
+        self._level = 0.5
 
     def open_photograph(self, index: int) -> None:
         """By its thumbnail."""
@@ -111,6 +116,13 @@ class Person:
         page.keyboard.press("Enter")
         self.viewer.await_type("patch", seconds=20)
         self.viewer.settle()
+
+    def set_level(self, level: float) -> None:
+        """The size of what a click selects, by the keys for it."""
+        steps = round(10 * (level - self._level))
+        for _ in range(abs(steps)):
+            self.viewer.page.keyboard.press("." if steps > 0 else ",")
+        self._level = level
 
     def make_masks(self) -> float:
         """By the button; gives the seconds until their objects are suggested."""
@@ -220,8 +232,27 @@ def _drawn(scene: Path, view: View) -> NDArray[np.bool_]:
     return label_map(loaded.gaussians, view.camera, selection_labels(selection)).ids.numpy() == 1
 
 
-Places = dict[str, list[tuple[float, float]]]
-"""Where each thing is clicked, as shares of the picture."""
+@dataclass(frozen=True)
+class Place:
+    """Where a thing is clicked, as shares of the picture, and its size."""
+
+    points: tuple[tuple[float, float], ...]
+    level: float = 0.5
+
+
+Places = dict[str, Place]
+
+
+def places_of(words: Sequence[str]) -> Places:
+    """``NAME=X,Y[+X,Y][@LEVEL]`` each."""
+    found: Places = {}
+    for word in words:
+        name, _, rest = word.partition("=")
+        where, _, level = rest.partition("@")
+        pairs = [one.partition(",") for one in where.split("+")]
+        points = tuple((float(x), float(y)) for x, _, y in pairs)
+        found[name] = Place(points, float(level or 0.5))
+    return found
 
 
 def pictured(splats: Path, scene: Path, places: Places, pictures: Path | None) -> dict[str, Any]:
@@ -234,8 +265,9 @@ def pictured(splats: Path, scene: Path, places: Places, pictures: Path | None) -
         viewer.ready()
         _picture(viewer, pictures, "masks")
         found: list[Any] = []
-        for number, (name, points) in enumerate((places or largest(scene)).items()):
-            for at, point in enumerate(points):
+        for number, (name, place) in enumerate((places or largest(scene)).items()):
+            person.set_level(place.level)
+            for at, point in enumerate(place.points):
                 answer = person.click(*point, modifiers=("Shift",) if at else ())
             found.append(answer.get("count") or answer.get("text"))
             _picture(viewer, pictures, f"{number + 1}-{name}")
@@ -269,12 +301,12 @@ def largest(scene: Path) -> Places:
             (x - camera.cx) * scale / WIDTH + 0.5,
             (y - camera.cy) * scale / HEIGHT + 0.5,
         )
-        found[f"thing {number + 1}"] = [shares]
+        found[f"thing {number + 1}"] = Place((shares,))
     return found
 
 
 def sheet(scene: Scene, files: list[Path]) -> UInt8[Tensor, "height width 3"]:
-    """What is in splat files, a column each, from the first view and from one opposite."""
+    """What is in splat files, a column each, from where the first view is and from behind."""
     columns: list[Tensor] = []
     first = scene.train_views[0].camera
     ahead = first.cam_from_world[2, :3]
@@ -283,7 +315,19 @@ def sheet(scene: Scene, files: list[Path]) -> UInt8[Tensor, "height width 3"]:
         gaussians = read_splats(path)
         drawn: list[Tensor] = []
         for camera in (first, behind.camera):
-            with prepare(gaussians, camera.resized(320, 240)) as view:
+            # A lens so long that the thing fills most of the picture.
+            pixels, _ = camera.project(gaussians.means.double())
+            low, high = (pixels.quantile(q, dim=0) for q in (0.02, 0.98))
+            side = 1.3 * float((high - low).max())
+            centre = (low + high) / 2
+            near = replace(
+                camera.resized(SIDE, SIDE),
+                fx=camera.fx * SIDE / side,
+                fy=camera.fy * SIDE / side,
+                cx=(camera.cx - float(centre[0])) * SIDE / side + SIDE / 2,
+                cy=(camera.cy - float(centre[1])) * SIDE / side + SIDE / 2,
+            )
+            with prepare(gaussians, near) as view:
                 drawn.append(view.picture())
         columns.append(torch.cat(drawn))
     return torch.cat(columns, dim=1)
@@ -300,17 +344,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
     parser.add_argument("scene", type=Path)
     parser.add_argument("data", type=Path, nargs="?")
-    parser.add_argument("--places", nargs="+", default=[], metavar="NAME=X,Y[+X,Y]")
+    parser.add_argument("--places", nargs="+", default=[], metavar="NAME=X,Y[+X,Y][@LEVEL]")
     parser.add_argument("--pictures", type=Path)
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         if args.scene.is_file():
-            places = {
-                name: [(float(x), float(y)) for x, _, y in (p.partition(",") for p in where)]
-                for name, _, rest in (one.partition("=") for one in args.places)
-                if (where := rest.split("+"))
-            }
+            places = places_of(args.places)
             made = pictured(args.scene, Path(folder) / "scene", places, args.pictures)
         else:
             if args.data is None:
