@@ -104,6 +104,7 @@ class ViewServer:
                 lifespan="off",
                 limit_concurrency=8 * guard.MAX_CLIENTS,
                 timeout_graceful_shutdown=1,
+                ws="websockets-sansio",  # what "auto" is in later versions of uvicorn
                 ws_max_size=guard.MAX_MESSAGE,
                 ws_per_message_deflate=False,
             )
