@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 import zipfile
+from dataclasses import replace
 from typing import Any
 
 import httpx
@@ -17,7 +18,7 @@ import torch
 from websockets.exceptions import ConnectionClosed
 
 from splatseg.errors import InputError
-from splatseg.io.scene import load_scene, save_scene_layer
+from splatseg.io.scene import load_scene, save_scene, save_scene_layer
 from splatseg.viewer._job_process import main
 from splatseg.viewer._server import ViewServer
 from support.viewer import (
@@ -579,6 +580,29 @@ def test_masks_at_hand_cover_all_views_those_of_sam_first(things) -> None:
     for path in (things / "evidence" / "big_sam").glob("first*"):
         path.unlink()
     assert at_hand() == "masks"
+
+
+def test_masks_that_were_stopped_are_gone_on_with(things, monkeypatch) -> None:
+    from splatseg.models.classical import Classical
+
+    views = load_scene(things)
+    second = replace(views.views[0], name="second")
+    save_scene(replace(views, views=(*views.views, second)), things)
+    masks, seen = Classical.masks, []
+
+    def stopped(self, image):
+        seen.append(image)
+        if len(seen) == 2:
+            raise KeyboardInterrupt
+        return masks(self, image)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Classical, "masks", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            main(["see", str(things), "cpu"], io.StringIO("{}"), io.StringIO())
+    out = io.StringIO()
+    assert main(["see", str(things), "cpu"], io.StringIO("{}"), out) == 0
+    assert "masks of 2 views by classical" in out.getvalue()
 
 
 def test_a_job_ends_with_the_server(serving, things, monkeypatch) -> None:

@@ -120,8 +120,12 @@ def _scene_folder(command: Command) -> Generator[Path]:
     if not path.exists():
         raise MissingFileError(f"{path}: there is no such scene, file or folder.")
     if not path.is_file():
-        if is_scene(path):
-            check_writable(path)  # what is done there is kept in it
+        if not is_scene(path):
+            raise InputError(
+                f"{path}: expected a scene folder, got none (no scene.json); `splatseg fit` makes "
+                "one of photographs, and a splat file is opened as it is."
+            )
+        check_writable(path)  # what is done there is kept in it
         yield path
         return
     if command.output is not None:

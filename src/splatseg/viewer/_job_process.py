@@ -68,9 +68,13 @@ def _say(out: TextIO, value: dict[str, Any]) -> None:
 def masks_at_hand(work: Work) -> str | None:
     """The evidence of masks that covers all views to learn from; of several, one of SAM first."""
     wanted = {view.name for view in work.scene.train_views or work.scene.views}
-    names = [
-        name for name in work.evidence_of("masks") if wanted <= set(work.evidence(name).view_names)
-    ]
+    names: list[str] = []
+    for name in work.evidence_names:
+        # What a `see` that was stopped has left cannot be opened; the same `see` goes on with it.
+        with contextlib.suppress(InputError):
+            evidence = work.evidence(name)
+            if evidence.kind == "masks" and wanted <= set(evidence.view_names):
+                names.append(name)
     return min(names, key=lambda name: ("sam" not in name, name), default=None)
 
 

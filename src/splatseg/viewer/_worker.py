@@ -17,6 +17,7 @@ from typing import Any, Protocol, TypeAlias, TypeVar
 from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError, SplatsegError
 from splatseg.viewer import _guard as guard
+from splatseg.viewer import _memory as memory
 from splatseg.viewer import _messages as messages
 
 T = TypeVar("T")
@@ -174,6 +175,7 @@ class Worker:
         self._jobs: deque[Job] = deque()
         self._running: dict[tuple[int, int], Job] = {}
         self._hint: Client | None = None
+        self._answered = 0
         self.closing = False
         self._opened: Future[None] = Future()
         self._thread = threading.Thread(target=self._run, name="splatseg view: worker", daemon=True)
@@ -473,6 +475,9 @@ class Worker:
     def _do_task(self, client: Client, message: messages.Incoming) -> None:
         work = self._of_answers().answer
         self.attempt(lambda: work(client, message), client, **about(message))
+        self._answered += 1
+        if self._answered % memory.EVERY == 0:
+            memory.give_back()
 
     def _do_call(self, work: Callable[[Any], Any], future: "Future[Any]") -> None:
         if not future.set_running_or_notify_cancel():
@@ -496,6 +501,8 @@ class Worker:
             _log.exception("a job failed")
             text = "something is wrong in the server, which has written it to its output"
             self.end_job(job, messages.Error(text=text, id=job.id))
+        finally:
+            memory.give_back()
 
     def _of_answers(self) -> Answers:
         if self._answers is None:
