@@ -23,7 +23,7 @@ import torch
 
 from splatseg.errors import InputError
 from support.fuzz.mutations import mutate
-from support.fuzz.targets import TARGETS, Target
+from support.fuzz.targets import Target
 
 LONGEST = 400
 """Characters of a message beside the file's path."""
