@@ -5,13 +5,28 @@ the source, and writes ``{None}|STR`` for an optional word; so it is given a cop
 which both are as a person wants to read them, and its answer is copied back.
 """
 
+import contextlib
 import dataclasses
+import functools
 import inspect
+import io
+import os
 import re
+import textwrap
 import types
 from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, Union, cast, get_args, get_origin, get_type_hints
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    Literal,
+    Union,
+    cast,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import docstring_parser
 import tyro
@@ -20,6 +35,12 @@ from splatseg.cli._words import names_as_flags, option_names
 from splatseg.core.options import removed_options
 from splatseg.core.typed_text import REPEATED
 from splatseg.errors import InputError, quoted
+
+if TYPE_CHECKING:
+    from splatseg.cli import CommandEntry
+
+_WIDTH = 80
+"""Columns of a kept page of help."""
 
 _SHARED = ("seed", "backend", "data", "json", "quiet")
 _ITEMS = {str: "names", int: "whole numbers", float: "numbers"}
@@ -204,16 +225,23 @@ def _texts(command: type[Any]) -> dict[str, str]:
     """The string below each field, flowing; a subclass's before its base's."""
     found: dict[str, str] = {}
     for cls in reversed(command.__mro__):
-        if not dataclasses.is_dataclass(cls):
-            continue
-        try:
-            parsed = docstring_parser.parse_from_object(cls)
-        except (OSError, TypeError):  # made at run time: it has no source
-            continue
-        for entry in parsed.params:
-            if entry.description is not None:
-                found[entry.arg_name] = flowing(entry.description)
+        if dataclasses.is_dataclass(cls) and cls.__module__ != types.__name__:
+            found |= _texts_below(cls)  # others were made at run time: they have no source
     return found
+
+
+@functools.cache
+def _texts_below(cls: type[Any]) -> dict[str, str]:
+    """The string below each field of a class; read once, for many commands share their bases."""
+    try:
+        parsed = docstring_parser.parse_from_object(cls)
+    except (OSError, TypeError):  # it has no source
+        return {}
+    return {
+        entry.arg_name: flowing(entry.description)
+        for entry in parsed.params
+        if entry.description is not None
+    }
 
 
 def _item_of(kind: Any) -> type[str] | type[int] | type[float] | None:
@@ -250,3 +278,42 @@ def _placeholder(kind: Any) -> str | None:
     if (item := _item_of(kind)) is not None:
         return f"{_PLACEHOLDERS[item]} .."
     return _PLACEHOLDERS.get(kind)
+
+
+def rendered_page(name: str, entry: "CommandEntry", words: Sequence[str] = ()) -> str:
+    """The help of a command, 80 columns wide.
+
+    Args:
+        name: The command.
+        entry: Where it is.
+        words: Further words that the help depends on, such as the method's.
+    """
+    kind, config = entry.kind_for(words)
+    printed = io.StringIO()
+    before = os.environ.get("COLUMNS")
+    os.environ["COLUMNS"] = str(_WIDTH)
+    try:
+        with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
+            parse(kind, [*words, "--help"], prog=f"splatseg {name}", config=config)
+    finally:
+        if before is None:
+            del os.environ["COLUMNS"]
+        else:
+            os.environ["COLUMNS"] = before
+    return wrapped(printed.getvalue())
+
+
+def wrapped(page: str) -> str:
+    """A page without lines that are too long, blanks at their ends or two empty lines in a row.
+
+    The heading of options within a method's options names them alone, as their flags do.
+    """
+    lines: list[str] = []
+    for line in re.sub(r"(?m)^ options\.(?=\w+ options *$)", " ", page).rstrip().splitlines():
+        if not line.strip() and lines and not lines[-1]:
+            continue
+        # A command line is to be copied in one piece.
+        long = len(line) > _WIDTH and not line.startswith("splatseg ")
+        further = "  " if line.startswith("- ") else ""
+        lines += textwrap.wrap(line, _WIDTH, subsequent_indent=further) if long else [line.rstrip()]
+    return "\n".join(lines) + "\n"
