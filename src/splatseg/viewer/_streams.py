@@ -9,6 +9,7 @@ Removed ones are marked as left out.
 import secrets
 import tempfile
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,8 @@ LEFT_OUT = 4095
 no object, others are an object's id + 1."""
 
 _VERSIONS = 1 << 32
+
+Number = TypeVar("Number", bound=np.generic)
 
 
 class Streams:
@@ -120,7 +123,7 @@ class Streams:
                 codes[session.confidence(edit.mask) >= MEMBER] = LEFT_OUT
         return self._drawn(codes)
 
-    def _drawn(self, values: NDArray[np.generic]) -> NDArray[np.generic]:
+    def _drawn(self, values: NDArray[Number]) -> NDArray[Number]:
         """Values of the scene's Gaussians as those of the Gaussians that are drawn."""
         edits = self._session.document.edits
         return values[self._session.edited_rows()] if changes_rows(edits) else values

@@ -100,7 +100,7 @@ test("shaders are changed in whole groups, or not at all", () => {
   assert.deepEqual(patch(chunks, 0.1), []);
   assert.equal(
     chunks.get("gsplatCornerVS"),
-    "a + 0.100000; b + 0.100000; max(mid - radius, 0.0001); sqrt(2.77063 * x); sqrt(2.77063 * y)",
+    "a + 0.400000; b + 0.400000; max(mid - radius, 0.0001); sqrt(2.77063 * x); sqrt(2.77063 * y)",
   );
   assert.equal(chunks.get("gsplatPS"), "return exp(x * -5.54126);");
   assert.match(chunks.get("gsplatCommonVS"), /clipValue\)\) \/ 5\.54126\)$/i);
@@ -108,6 +108,6 @@ test("shaders are changed in whole groups, or not at all", () => {
   other.set("gsplatPS", "return 1.0;");
   assert.deepEqual(patch(other, 0.1), ["shape of a Gaussian"]);
   assert.match(other.get("gsplatCornerVS"), /sqrt\(2\.0 \* x\)/);
-  assert.match(other.get("gsplatCornerVS"), /\+ 0\.100000/);
+  assert.match(other.get("gsplatCornerVS"), /\+ 0\.400000/);
   assert.deepEqual(patch(new Map(), 0.1), ["low pass", "shape of a Gaussian"]);
 });

@@ -41,9 +41,11 @@ void modifySplatColor(vec3 center, inout vec4 color) {
 function patches(lowPass) {
   const reach = REACH.toFixed(5);
   const half = (REACH / 2).toFixed(5);
+  // The engine counts in half pixels, so that its 0.3 are 0.075 square pixels.
+  const variance = (4 * lowPass).toFixed(6);
   return {
     "low pass": [
-      ["gsplatCornerVS", "+ 0.3", `+ ${lowPass.toFixed(6)}`],
+      ["gsplatCornerVS", "+ 0.3", `+ ${variance}`],
       ["gsplatCornerVS", "max(mid - radius, 0.1)", "max(mid - radius, 0.0001)"],
     ],
     "shape of a Gaussian": [
@@ -132,6 +134,8 @@ export class Engine {
     app.requestAnimationFrame = () => {};
     app.start();
     const { gsplat } = app.scene;
+    // 32 bytes a Gaussian; of the other 24 the eight-bit scales are seen.
+    gsplat.dataFormat = pc.GSPLATDATA_LARGE;
     gsplat.antiAlias = antialiased;
     gsplat.alphaClipForward = 1 / 255;
     gsplat.minPixelSize = 0;
