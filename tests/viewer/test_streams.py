@@ -1,10 +1,13 @@
 """What a page that draws is told: Gaussians by version, objects and selection of each."""
 
 import struct
+import tempfile
 import zlib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import httpx
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -159,8 +162,6 @@ def test_the_file_is_the_scenes_own(server, drawing, things) -> None:
 
 
 def test_a_scene_in_memory_is_written_once(serving, things, tmp_path) -> None:
-    from dataclasses import replace
-
     scene = replace(load_scene(things), root=None)
     server = serving(scene)
     with opened(server, stage="gpu") as page, logged_in(server) as client:
@@ -180,8 +181,6 @@ def test_versions_are_numbers(client, query) -> None:
 
 
 def test_gaussians_are_behind_the_guard(server, drawing) -> None:
-    import httpx
-
     version, _ = stream(drawing, b"O")
     address = f"{base_url(server)}/gaussians?version={version}"
     assert httpx.get(address).status_code == 403
@@ -199,9 +198,6 @@ def test_loads_are_limited(server, client, monkeypatch) -> None:
 
 
 def test_nothing_stays_in_the_temporary_folder(serving, things, tmp_path, monkeypatch) -> None:
-    import tempfile
-    from dataclasses import replace
-
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     server = serving(replace(load_scene(things), root=None))
     with opened(server, stage="gpu") as page, logged_in(server) as client:
