@@ -36,10 +36,11 @@ from splatseg.io.splats import read_splats, write_splats
 from splatseg.prompting.graph import build_graph, holes
 from splatseg.prompting.prompts import AxisBox, Ball, Similar, ViewPrompt
 from splatseg.tasks import SelectOptions, open_selector
-from splatseg.viewer._products import Owners, similarity_of
+from splatseg.viewer._products import Owners
 from splatseg.viewer._selecting import bytes_of, front_view, selection_of
 from splatseg.viewer._session import Session, open_session
 from splatseg.viewer._shaping import combined
+from splatseg.viewer._shown import similarity_of
 from splatseg.viewer._state import Document
 from splatseg.viewer.commands import (
     Accept,

@@ -1,6 +1,6 @@
-"""What is made of a document: labels, an edited scene, and files.
+"""What is made of a document: labels, and files of a scene as it was edited.
 
-Edits become those of `splatseg.edit`, in their order; labels follow them row by row.
+Labels follow edits row by row.
 """
 
 import hashlib
@@ -16,16 +16,11 @@ from numpy.typing import NDArray
 from splatseg.core import (
     UNLABELLED,
     Edited,
-    Gaussians,
     InstanceFacts,
     Labels,
     LayerInfo,
     Scene,
-    Selection,
-    Similarity,
 )
-from splatseg.core.rigid import rotation_from_quaternion
-from splatseg.edit import duplicate, recolour, remove, transform
 from splatseg.errors import InputError, quoted
 from splatseg.io.atomic import named_write_failures, path_inside
 from splatseg.io.export.splats import holds_columns
@@ -151,22 +146,6 @@ def save(labels: Labels, root: Path, name: str) -> None:
     save_scene_layer(labels, root, name)
 
 
-def shown(document: Document, owners: Owners, masks: Masks) -> NDArray[np.bool_]:
-    """(n,) which Gaussians of the scene are shown.
-
-    Not those that were removed, nor those of hidden objects; where objects are isolated, theirs
-    alone.
-    """
-    ids, _ = owners.of(document.objects)
-    found = ~np.isin(ids, [one.id for one in document.objects if not one.visible])
-    if document.isolated:
-        found &= np.isin(ids, document.isolated)
-    for edit in document.edits:
-        if edit.kind == "remove":
-            found &= masks.get(edit.mask) < MEMBER
-    return found
-
-
 def digest_of(scene: Scene) -> str:
     """Tells the Gaussians of a scene from those of others: a digest of their centres."""
     means = scene.gaussians.means.detach().cpu().float().contiguous().numpy()
@@ -185,49 +164,6 @@ def _class_ids(document: Document, scene: Scene) -> dict[str, int]:
             known[name] = following
         found[name] = known[name]
     return found
-
-
-def similarity_of(edit: Edit) -> Similarity:
-    """The movement of an edit: x becomes about + s R (x - about) + t."""
-    rotation = rotation_from_quaternion(torch.tensor(edit.rotation, dtype=torch.float64))
-    about = torch.tensor(edit.about, dtype=torch.float64)
-    translation = torch.tensor(edit.translation, dtype=torch.float64)
-    return Similarity(
-        rotation=rotation,
-        translation=about + translation - edit.scale * (rotation @ about),
-        scale=edit.scale,
-    )
-
-
-def edited(gaussians: Gaussians, edits: Sequence[Edit], masks: Masks) -> Edited:
-    """Gaussians after edits, each of which is of those that were there before the first.
-
-    What was removed is not changed any more; copies stay as they were made.
-    """
-    found = Edited.unchanged(gaussians)
-    copied = torch.zeros(len(gaussians), dtype=torch.bool)
-    for edit in edits:
-        chosen = torch.from_numpy(masks.get(edit.mask) >= MEMBER)[found.rows] & ~copied
-        if not bool(chosen.any()):
-            continue
-        step = _step(found.gaussians, Selection(mask=chosen), edit)
-        copied = copied[step.rows]
-        copied[len(found) :] = True
-        found = found.then(step)
-    return found
-
-
-def _step(gaussians: Gaussians, selection: Selection, edit: Edit) -> Edited:
-    match edit.kind:
-        case "remove":
-            return remove(gaussians, selection)
-        case "duplicate":
-            return duplicate(gaussians, selection, similarity_of(edit))
-        case "move":
-            return transform(gaussians, similarity_of(edit), selection=selection)
-        case "recolour":
-            colour = [value / 255 for value in edit.colour or (0, 0, 0)]
-            return recolour(gaussians, selection, colour=colour)
 
 
 def exports_folder(scene: Scene, folder: Path | None) -> Path:

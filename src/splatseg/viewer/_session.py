@@ -17,19 +17,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from splatseg.core import (
-    UNLABELLED,
-    Edited,
-    Labels,
-    Scene,
-    Selection,
-    apply_rows,
-)
+from splatseg.core import UNLABELLED, Labels, Scene, Selection, apply_rows
 from splatseg.errors import InputError
 from splatseg.io.scene import load_scene
 from splatseg.io.scene_folder import scene_path
 from splatseg.io.splats import WritableFormat, read_splats
-from splatseg.prompting.prompts import AxisBox, Ball, Lasso, SelectionPrompt, Similar, ViewPrompt
+from splatseg.prompting.prompts import SelectionPrompt
 from splatseg.prompting.seen import ViewCache
 from splatseg.render import BackendName
 from splatseg.tasks.work import SILENT, Observer
@@ -46,6 +39,7 @@ from splatseg.viewer._selecting import (
     selection_of,
 )
 from splatseg.viewer._shaping import Mode, SplitBy
+from splatseg.viewer._shown import Shown
 from splatseg.viewer._state import (
     Command,
     Confidence,
@@ -125,9 +119,10 @@ class Session:
         self._observer = observer
         self._editor = Editor(len(scene.gaussians), journal)
         self._masks, self._history = self._editor.masks, self._editor.history
-        self._selecting = Selecting(scene, backend=backend, observer=observer)
-        self._owners = products.Owners(len(scene.gaussians), self._masks)
-        self._edited: tuple[tuple[object, ...], Edited] | None = None
+        self._shown = Shown(scene, self._masks, lambda: self.document)
+        self._selecting = Selecting(
+            scene, shown=self._shown.in_view, backend=backend, observer=observer
+        )
 
     def __enter__(self) -> Self:
         return self
@@ -215,20 +210,25 @@ class Session:
         return None if mask is None else selection_of(self._masks.get(mask))
 
     @property
+    def shown(self) -> Shown:
+        """What is shown of the scene: without what is hidden, edits made."""
+        return self._shown
+
+    @property
     def visible(self) -> NDArray[np.bool_]:
         """(n,) which Gaussians of the scene are shown.
 
-        Not those that were removed, nor those of hidden objects; where objects are isolated,
-        theirs alone.
+        Not those of which edits left nothing, nor those of hidden objects; where objects are
+        isolated, theirs alone.
         """
-        return products.shown(self.document, self._owners, self._masks)
+        return self._shown.visible
 
     def owners(self) -> NDArray[np.int32]:
         """(n,) the id of the object that each Gaussian belongs to, -1 for none.
 
         Of several objects it is the one that is surest of it, of equally sure ones the later.
         """
-        return self._owners.of(self.document.objects)[0]
+        return self._shown.owners.of(self.document.objects)[0]
 
     @property
     def things(self) -> NDArray[np.int32]:
@@ -336,13 +336,26 @@ class Session:
             made, record = self._selecting.find_words(prompts)
             tell(made)
         else:
-            one = isinstance(prompts, ViewPrompt | AxisBox | Ball | Lasso | Similar)
+            one = isinstance(prompts, SelectionPrompt)
             given = (prompts,) if one else tuple(prompts)
             made, record = self._selecting.select(given, level=level, draft=tell)
         earlier = self.document.prompt if under == self.document.selection else None
         record = joined_record(record, None if below is None else earlier, mode)
-        mask = self._masks.put(shaping.combined(bytes_of(made), below, mode))
-        return self.do(Select(mask if mask.count else None, record), author=author)
+        values = shaping.combined(bytes_of(made), below, mode)
+        return self.select_values(values, record, author=author)
+
+    def select_values(
+        self, values: Confidence, record: Mapping[str, Any], *, author: str = ""
+    ) -> Document:
+        """Select by confidences; Gaussians that were removed are left out.
+
+        Args:
+            values: (n,) from 0 to 255, from 128 on for what is selected.
+            record: What selected it, in values that JSON holds.
+            author: Who does it.
+        """
+        mask = self._masks.put(np.where(self._shown.present, values, 0).astype(np.uint8))
+        return self.do(Select(mask if mask.count else None, dict(record)), author=author)
 
     def similarity(self, words: str) -> NDArray[np.float32]:
         """(n,) how likely words mean each Gaussian, in [0, 1].
@@ -413,7 +426,7 @@ class Session:
     ) -> Document:
         step: dict[str, Any] = {"kind": what} | ({} if factor is None else {"factor": factor})
         record = recorded_after(self.document.prompt, [step])
-        return self.do(Select(self._masks.put(values), record), author=author)
+        return self.select_values(values, record, author=author)
 
     # Objects.
 
@@ -477,7 +490,7 @@ class Session:
         """
         return products.labels_of(
             self.document,
-            self._owners,
+            self._shown.owners,
             self._scene,
             [entry.command for entry in self._history.entries],
             ids=None if ids is None else tuple(ids),
@@ -523,7 +536,7 @@ class Session:
         only = None if ids is None else tuple(ids)
         labels = None
         if self.document.objects or only is not None:
-            labels = apply_rows(self.labels(only), self._edits())
+            labels = apply_rows(self.labels(only), self._shown.edited)
             if only is not None and not bool((labels.ids != UNLABELLED).any()):
                 raise InputError("export: nothing of these objects is left in the scene.")
         return products.export(
@@ -540,15 +553,8 @@ class Session:
 
     def edited_scene(self) -> Scene:
         """The scene with its edits; without a folder, unless there are none."""
-        return products.edited_scene(self._scene, self._edits(), self.document.edits)
+        return products.edited_scene(self._scene, self._shown.edited, self.document.edits)
 
     def edited_rows(self) -> NDArray[np.int64]:
         """(m,) of each Gaussian of the edited scene, the row in the scene that it comes from."""
-        return self._edits().rows.numpy()
-
-    def _edits(self) -> Edited:
-        edits = self.document.edits
-        if self._edited is None or self._edited[0] != edits:
-            made = products.edited(self._scene.gaussians, edits, self._masks)
-            self._edited = edits, made
-        return self._edited[1]
+        return self._shown.edited.rows.numpy()

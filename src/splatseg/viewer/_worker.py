@@ -14,6 +14,8 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias, TypeVar
 
+import msgspec
+
 from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError, SplatsegError
 from splatseg.viewer import _guard as guard
@@ -337,8 +339,12 @@ class Worker:
             order = sorted(self._clients.values(), key=lambda client: client.author != author)
             self._clients = {client.id: client for client in order}
             for client in self._clients.values():
-                if client.camera is not None and client.waiting_camera is None:
+                waiting = client.waiting_camera
+                if client.camera is not None and waiting is None:
                     client.waiting_camera = _at_rest(client.camera)
+                elif waiting is not None and client.author == author:
+                    # A move that was looked at is made now, and not to be drawn twice.
+                    client.waiting_camera = msgspec.structs.replace(waiting, preview=None)
 
     def broadcast(self, message: messages.Outgoing) -> None:
         """Send a message to every page."""
@@ -504,9 +510,8 @@ class Worker:
 
 
 def _at_rest(request: messages.DrawRequest) -> messages.DrawRequest:
-    import msgspec
-
-    return msgspec.structs.replace(request, rest=True)
+    """The same camera at rest, of the document as it is."""
+    return msgspec.structs.replace(request, rest=True, preview=None)
 
 
 def about(message: messages.Incoming) -> dict[str, int | str | None]:

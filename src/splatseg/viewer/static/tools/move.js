@@ -34,7 +34,12 @@ export class MoveTool {
     this.kind = "translate";
     /** @type {{axis: number, from: Point, about: Vec3, motion: Motion}|null} */
     this.grip = null;
+    /** What was let go of, until the document says so. @type {Motion|null} */
+    this.sent = null;
     this.near = NONE;
+    app.store.on(["document", "connection"], () => {
+      this.sent = null;
+    });
   }
 
   get says() {
@@ -57,6 +62,13 @@ export class MoveTool {
       return { about, radius };
     }
     return selection ? { about: this.app.camera.pivot, radius: 0 } : null;
+  }
+
+  /** A move under way, as the picture is to show it. */
+  preview() {
+    const { store } = this.app;
+    if (!this.grip || !store.features.has("preview")) return null;
+    return { ids: store.document.selection ? null : [...store.picked], ...this.grip.motion };
   }
 
   /** Scene units a CSS pixel at a point. @param {Vec3} about @returns {number} */
@@ -120,8 +132,7 @@ export class MoveTool {
     const { grip } = this;
     if (!grip) return;
     grip.motion = this.motion(point);
-    const { app } = this;
-    if (app.store.features.has("preview")) app.server.moved();
+    this.app.server.moved();
   }
 
   /** What a drag to a point means. @param {Point} point @returns {Motion} */
@@ -162,15 +173,23 @@ export class MoveTool {
     if (!this.grip) return;
     const motion = this.motion(point);
     this.grip = null;
-    this.commit(motion);
+    this.app.server.hold();
+    if (this.commit(motion)) this.sent = motion;
+    else this.app.server.rest();
   }
 
-  /** @param {Motion} motion */
+  /** Make a move. @param {Motion} motion @returns {boolean} Whether there is one. */
   commit(motion) {
     const turned = Math.abs(motion.rotation[0]) < 1 - 1e-9;
     const shifted = motion.translation.some((value) => Math.abs(value) > 1e-9);
-    if (!turned && !shifted && Math.abs(motion.scale - 1) < 1e-6) return;
-    this.app.edit("move", motion);
+    if (!turned && !shifted && Math.abs(motion.scale - 1) < 1e-6) return false;
+    return this.app.edit("move", motion);
+  }
+
+  /** The server did not make the move. */
+  refused() {
+    this.sent = null;
+    this.app.server.rest();
   }
 
   /** Steps by arrow keys; Shift: by depth. @param {number} x @param {number} y @returns {boolean} */
@@ -205,6 +224,7 @@ export class MoveTool {
   cancel() {
     const had = this.grip !== null;
     this.grip = null;
+    if (had) this.app.server.rest();
     return had;
   }
 
@@ -213,11 +233,14 @@ export class MoveTool {
     const subject = this.subject();
     if (!subject) return;
     const { stage } = this.app;
-    const motion = this.grip?.motion;
+    const motion = this.grip?.motion ?? this.sent;
     const about = motion ? add(subject.about, motion.translation) : subject.about;
     const middle = stage.css(about);
     if (middle.depth <= 0) return;
-    if (motion && subject.radius > 0) this.drawGhost(g, subject, motion);
+    const { features } = this.app.store;
+    if (motion && subject.radius > 0 && !features.has("preview")) {
+      this.drawGhost(g, subject, motion);
+    }
     if (this.kind === "scale") {
       const factor = motion?.scale ?? 1;
       const path = new Path2D();
