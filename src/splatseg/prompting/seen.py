@@ -71,7 +71,7 @@ class ViewCache:
         self._gaussians = gaussians
         self._backend = backend
         self._capacity = capacity
-        self._edited = edited or (lambda _: None)
+        self._edited = edited or _as_it_is
         # Camera and edit are kept as long as their numbers are a key, which therefore is nobody
         # else's.
         self._views: OrderedDict[tuple[int, int], tuple[Camera, Edited | None, PreparedView]] = (
@@ -147,6 +147,10 @@ class ViewCache:
         for _, _, prepared in self._views.values():
             prepared.close()
         self._views.clear()
+
+
+def _as_it_is(_: View | None) -> None:
+    """No view shows an edit."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -55,10 +55,17 @@ export class SphereTool {
   move(point) {
     this.at = point;
     const points = this.press?.points;
-    const last = points?.at(-1);
-    if (!points || !last || points.length >= MOST_POINTS) return;
     const apart = Math.max(2, APART * this.radius);
-    if (Math.hypot(point.x - last.x, point.y - last.y) >= apart) points.push(point);
+    // A quick pointer skips pixels; the brush goes all the way.
+    while (points && points.length < MOST_POINTS) {
+      const last = points[points.length - 1];
+      const away = Math.hypot(point.x - last.x, point.y - last.y);
+      if (away < apart) return;
+      const share = apart / away;
+      const x = last.x + share * (point.x - last.x);
+      const y = last.y + share * (point.y - last.y);
+      points.push({ ...point, x, y });
+    }
   }
 
   /** @param {Point} point */
