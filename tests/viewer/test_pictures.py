@@ -107,7 +107,7 @@ def test_edits_are_drawn(session, kind, more) -> None:
     moved = {} if kind == "recolour" else {"translation": (0.0, 0.0, 0.4)}
     colour = {"colour": (0, 0, 255)} if kind == "recolour" else {}
     session.do(Apply(Edit(kind=kind, mask=mask, **moved, **colour)))
-    assert len(session.edited_rows()) == len(session.scene.gaussians) + more
+    assert len(session.shown.rows) == len(session.scene.gaussians) + more
     after, ids_after = drawn()
     assert (before != after).any()
     assert (ids != ids_after).any() == (kind != "recolour")

@@ -131,7 +131,7 @@ def test_a_copy_answers_for_what_it_is_a_copy_of(session, ids) -> None:
     for place in (ABOVE, HERE):
         assert np.array_equal(clicked(session, place), ids == 1)
     edit(session, ids, "remove")
-    assert np.array_equal(session.visible, np.ones(1000, bool)), "the copy stays"
+    assert np.array_equal(session.shown.visible, np.ones(1000, bool)), "the copy stays"
     assert np.array_equal(clicked(session, ABOVE), ids == 1)
     with pytest.raises(InputError, match="the sky"):
         clicked(session, HERE)
@@ -145,7 +145,7 @@ def test_what_was_recoloured_is_where_it_was(session, ids) -> None:
 @pytest.mark.parametrize("name", ["page", "front"])
 def test_what_was_removed_cannot_be_selected(session, ids, name) -> None:
     edit(session, ids, "remove")
-    assert np.array_equal(session.visible, ids != 1)
+    assert np.array_equal(session.shown.visible, ids != 1)
     if name == "page":
         with pytest.raises(InputError, match="the sky"):
             clicked(session, HERE)

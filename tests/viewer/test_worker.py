@@ -12,7 +12,8 @@ import torch
 from splatseg.errors import InputError
 from splatseg.viewer import _guard as guard
 from splatseg.viewer import _messages as messages
-from splatseg.viewer._worker import Client, Job, Worker
+from splatseg.viewer._client import Client, Job
+from splatseg.viewer._worker import Worker
 from support.viewer import json_camera
 
 

@@ -14,6 +14,7 @@ from splatseg.render import BackendName
 from splatseg.tasks.work import EXPORTS_FOLDER
 from splatseg.viewer import _jobs as jobs
 from splatseg.viewer import _messages as messages
+from splatseg.viewer._client import Client, Job
 from splatseg.viewer._commands import command_of, confidence_of, edit_of
 from splatseg.viewer._document import MEMBER, Confidence, Document, Edit, Mask, Select
 from splatseg.viewer._draw import Drawer, Pace
@@ -24,7 +25,7 @@ from splatseg.viewer._selecting import bytes_of
 from splatseg.viewer._session import Session, open_session
 from splatseg.viewer._shaping import combined
 from splatseg.viewer._tint import RAMP_STOPS
-from splatseg.viewer._worker import Client, Job, Worker
+from splatseg.viewer._worker import Worker
 
 T = TypeVar("T")
 
@@ -137,8 +138,8 @@ class SceneAnswers:
             features=list(messages.FEATURES),
             ramp=list(RAMP_STOPS),
             document=self._mirror.document(session.document),
-            undo=session.undo_label,
-            redo=session.redo_label,
+            undo=session.history.undo_label,
+            redo=session.history.redo_label,
             clients=len(self._worker.clients),
             me=client.id,
             ready=self._ready,
@@ -163,8 +164,8 @@ class SceneAnswers:
             self._mirror.patch(
                 old,
                 new,
-                undo=self._session.undo_label,
-                redo=self._session.redo_label,
+                undo=self._session.history.undo_label,
+                redo=self._session.history.redo_label,
                 author=author,
             )
         )

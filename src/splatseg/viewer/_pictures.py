@@ -192,8 +192,8 @@ class _Look:
         self.revision = document.revision
         self._session = session
         self._document = document
-        self._rows = session.edited_rows() if changes_rows(document.edits) else None
-        self.shown: NDArray[np.bool_] = self.drawn(session.visible)
+        self._rows = session.shown.rows if changes_rows(document.edits) else None
+        self.shown: NDArray[np.bool_] = self.drawn(session.shown.visible)
         self._owners: NDArray[np.int32] | None = None
         self._ids: NDArray[np.int32] | None = None
         self._objects: list[tuple[NDArray[np.bool_], tuple[int, int, int]]] | None = None
@@ -217,7 +217,7 @@ class _Look:
     def owners(self) -> NDArray[np.int32]:
         """The object of each Gaussian, -1 for none."""
         if self._owners is None:
-            self._owners = self.drawn(self._session.owners())
+            self._owners = self.drawn(self._session.shown.owners)
         return self._owners
 
     @property

@@ -31,13 +31,10 @@ from splatseg.tasks import ExportOptions, export_scene
 from splatseg.tasks.work import EXPORTS_FOLDER, Observer, layer_versions
 from splatseg.viewer._journal import command_to_json
 from splatseg.viewer._state import (
-    MEMBER,
     Command,
     Confidence,
     Document,
     Edit,
-    Masks,
-    Object,
 )
 
 METHOD = "view"
@@ -49,48 +46,9 @@ _LAYER = "objects"
 _SUFFIXES: Mapping[str, str] = {"splat": ".ply", "points": ".ply", "table": ".csv"}
 
 
-class Owners:
-    """Which object each Gaussian belongs to: the surest, of equally sure ones the later.
-
-    What was found is kept, and gone on with where objects were only added.
-
-    Args:
-        gaussians: Gaussians of the scene.
-        masks: The masks of the objects.
-    """
-
-    def __init__(self, gaussians: int, masks: Masks) -> None:
-        self._gaussians = gaussians
-        self._masks = masks
-        self._known: tuple[tuple[int, str], ...] = ()
-        self._ids = np.full(gaussians, UNLABELLED, np.int32)
-        self._sure = np.zeros(gaussians, np.uint8)
-
-    def of(self, objects: Sequence[Object]) -> tuple[NDArray[np.int32], Confidence]:
-        """The id of the object of each Gaussian, -1 for none, and its confidence, 0 to 255."""
-        wanted = tuple((one.id, one.mask.id) for one in objects)
-        done = len(self._known)
-        if wanted[:done] != self._known:
-            done = 0
-            self._ids = np.full(self._gaussians, UNLABELLED, np.int32)
-            self._sure = np.zeros(self._gaussians, np.uint8)
-        if done < len(wanted):
-            ids, sure = self._ids.copy(), self._sure.copy()
-            for one in objects[done:]:
-                confidence = self._masks.get(one.mask)
-                better = (confidence >= MEMBER) & (confidence >= sure)
-                ids[better] = one.id
-                sure[better] = confidence[better]
-            self._ids, self._sure = ids, sure
-        self._known = wanted
-        for array in (self._ids, self._sure):
-            array.flags.writeable = False
-        return self._ids, self._sure
-
-
 def labels_of(
     document: Document,
-    owners: Owners,
+    owned: tuple[NDArray[np.int32], Confidence],
     scene: Scene,
     commands: Sequence[Command],
     *,
@@ -100,7 +58,7 @@ def labels_of(
 
     Args:
         document: Whose objects.
-        owners: Which object each Gaussian belongs to.
+        owned: The id of the object of each Gaussian, -1 for none, and how sure it is of it.
         scene: The scene; its class table gives classes their ids.
         commands: What made the document, for the record.
         ids: Only these objects; None takes all.
@@ -111,7 +69,7 @@ def labels_of(
     chosen = document.objects if ids is None else [document.object(id) for id in ids]
     if not chosen:
         raise InputError("objects: expected at least one, got none; keep a selection first.")
-    found, sure = owners.of(document.objects)
+    found, sure = owned
     rows = np.isin(found, [one.id for one in chosen])
     classes = _class_ids(document, scene)
     made = [command_to_json(command) for command in commands]
@@ -205,8 +163,10 @@ def export(
         observer: Is told of the progress.
 
     Raises:
-        InputError: If the name is none, or there is nothing to write.
+        InputError: If the name is none, or there is nothing to write: no object is left.
     """
+    if only is not None and labels is not None and not bool((labels.ids != UNLABELLED).any()):
+        raise InputError("export: nothing of these objects is left in the scene.")
     check_name("export", name)
     ending = f".{format.rstrip('3')}" if format is not None and what == "splat" else None
     path = folder / (name if "." in name else name + (ending or _SUFFIXES.get(what, "")))

@@ -151,51 +151,47 @@ class Selecting:
         middle = [[view.camera.width / 2, view.camera.height / 2]]
         try:
             prompt = ViewPrompt(view=view, points=torch.tensor(middle))
-            self.select((prompt,), level=None)
+            self.select(prompt, level=None, draft=lambda _: None)
         except InputError:
             # The middle of the view is sky: all that takes long was opened.
             return
 
     def select(
         self,
-        prompts: Sequence[SelectionPrompt],
+        prompts: SelectionPrompt | Sequence[SelectionPrompt] | str,
         *,
         level: float | None,
-        draft: Callable[[Selection], None] | None = None,
+        draft: Callable[[Selection], None],
     ) -> tuple[Selection, dict[str, Any]]:
         """What prompts mean, and the record of it.
 
         Args:
-            prompts: What is shown; at least one.
+            prompts: What is shown; at least one. Or words.
             level: 0 asks for the finest parts, 0.5 for objects, 1 for groups; None lets the source
                 choose.
             draft: Is called with what the source says, before it is cleaned.
 
         Raises:
-            InputError: If nothing is shown, or what is shown is nothing.
+            InputError: If nothing is shown, or what is shown is nothing; no layer answers words,
+                or nothing answers to these.
         """
+        if isinstance(prompts, str):
+            answers = self._asked().ask([prompts])
+            draft(answers.selection())
+            record = {"kind": "words", "text": prompts}
+            return answers.selection(), {"source": f"layer {answers.layer}", "prompts": [record]}
+        given = (prompts,) if isinstance(prompts, SelectionPrompt) else tuple(prompts)
         selector = self._opened()
         options = replace(self._options(), granularity="auto" if level is None else 1 - level)
 
         def tell(confidence: Tensor) -> None:
-            if draft is not None:
-                draft(Selection.of_confidence(confidence.cpu()))
+            draft(Selection.of_confidence(confidence.cpu()))
 
-        made = selector.select(prompts, options=options, advise=False, draft=tell)
+        made = selector.select(given, options=options, advise=False, draft=tell)
         self.seconds = dict(made.seconds)
-        places = all(isinstance(prompt, Solid) for prompt in prompts)
+        places = all(isinstance(prompt, Solid) for prompt in given)
         source = "" if places else (self.source or COLOUR)
-        return made.selection, {"source": source, "prompts": self._records(prompts, level)}
-
-    def find_words(self, words: str) -> tuple[Selection, dict[str, Any]]:
-        """What answers to words, and the record of it.
-
-        Raises:
-            InputError: If no layer answers words, or nothing answers to these.
-        """
-        answers = self._asked().ask([words])
-        record = {"kind": "words", "text": words}
-        return answers.selection(), {"source": f"layer {answers.layer}", "prompts": [record]}
+        return made.selection, {"source": source, "prompts": self._records(given, level)}
 
     def similarity(self, words: str) -> Float[Tensor, "n"]:
         """How likely words mean each Gaussian, in [0, 1].

@@ -10,11 +10,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from splatseg.core import Edited, Gaussians, Scene, Selection, Similarity, View
+from splatseg.core import UNLABELLED, Edited, Gaussians, Scene, Selection, Similarity, View
 from splatseg.core.rigid import rotation_from_quaternion
 from splatseg.edit import duplicate, recolour, remove, transform
-from splatseg.viewer._document import MEMBER, Document, Edit, Masks
-from splatseg.viewer._products import Owners
+from splatseg.viewer._document import MEMBER, Confidence, Document, Edit, Masks, Object
 
 
 class Shown:
@@ -34,13 +33,29 @@ class Shown:
         self._made: tuple[tuple[Edit, ...], Edited, NDArray[np.bool_]] | None = None
         self._moved: tuple[tuple[Edit, ...], NDArray[np.float32]] | None = None
         self._seen: tuple[int, tuple[Edit, ...], NDArray[np.bool_], Edited | None] | None = None
-        self.owners = Owners(len(scene.gaussians), masks)
+        self._owners = Owners(len(scene.gaussians), masks)
+
+    @property
+    def owned(self) -> tuple[NDArray[np.int32], Confidence]:
+        """(n,) the id of the object of each Gaussian, -1 for none, and its confidence, 0 to 255.
+
+        Of several objects it is the one that is surest of it, of equally sure ones the later.
+        """
+        return self._owners.of(self._document().objects)
+
+    @property
+    def owners(self) -> NDArray[np.int32]:
+        """(n,) the id of the object that each Gaussian belongs to, -1 for none."""
+        return self.owned[0]
 
     @property
     def visible(self) -> NDArray[np.bool_]:
-        """(n,) see `Session.visible`."""
-        document = self._document()
-        ids, _ = self.owners.of(document.objects)
+        """(n,) which Gaussians of the scene are shown.
+
+        Not those of which edits left nothing, nor those of hidden objects; where objects are
+        isolated, theirs alone.
+        """
+        document, ids = self._document(), self.owners
         found = ~np.isin(ids, [one.id for one in document.objects if not one.visible])
         if document.isolated:
             found &= np.isin(ids, document.isolated)
@@ -89,6 +104,11 @@ class Shown:
         return self._edits()[0]
 
     @property
+    def rows(self) -> NDArray[np.int64]:
+        """(m,) of each Gaussian after all edits, the one of the scene that it comes from."""
+        return self.edited.rows.numpy()
+
+    @property
     def copies(self) -> NDArray[np.bool_]:
         """(m,) which of the edited Gaussians are copies, that no later edit changes."""
         return self._edits()[1]
@@ -131,6 +151,45 @@ class Shown:
         return Edited(
             gaussians=gaussians.replace(opacities=gaussians.opacities * lit), rows=found.rows
         )
+
+
+class Owners:
+    """Which object each Gaussian belongs to: the surest, of equally sure ones the later.
+
+    What was found is kept, and gone on with where objects were only added.
+
+    Args:
+        gaussians: Gaussians of the scene.
+        masks: The masks of the objects.
+    """
+
+    def __init__(self, gaussians: int, masks: Masks) -> None:
+        self._gaussians = gaussians
+        self._masks = masks
+        self._known: tuple[tuple[int, str], ...] = ()
+        self._ids = np.full(gaussians, UNLABELLED, np.int32)
+        self._sure = np.zeros(gaussians, np.uint8)
+
+    def of(self, objects: Sequence[Object]) -> tuple[NDArray[np.int32], Confidence]:
+        """The id of the object of each Gaussian, -1 for none, and its confidence, 0 to 255."""
+        wanted = tuple((one.id, one.mask.id) for one in objects)
+        done = len(self._known)
+        if wanted[:done] != self._known:
+            done = 0
+            self._ids = np.full(self._gaussians, UNLABELLED, np.int32)
+            self._sure = np.zeros(self._gaussians, np.uint8)
+        if done < len(wanted):
+            ids, sure = self._ids.copy(), self._sure.copy()
+            for one in objects[done:]:
+                confidence = self._masks.get(one.mask)
+                better = (confidence >= MEMBER) & (confidence >= sure)
+                ids[better] = one.id
+                sure[better] = confidence[better]
+            self._ids, self._sure = ids, sure
+        self._known = wanted
+        for array in (self._ids, self._sure):
+            array.flags.writeable = False
+        return self._ids, self._sure
 
 
 def changes_rows(edits: Sequence[Edit]) -> bool:
