@@ -30,7 +30,6 @@ from splatseg.viewer import _products as products
 from splatseg.viewer import _shaping as shaping
 from splatseg.viewer._editor import Callback, Editor
 from splatseg.viewer._journal import Journal
-from splatseg.viewer._masks import MaskStore
 from splatseg.viewer._selecting import (
     Selecting,
     bytes_of,
@@ -44,7 +43,6 @@ from splatseg.viewer._state import (
     Command,
     Confidence,
     Document,
-    History,
     Mask,
     Select,
     Split,
