@@ -13,7 +13,7 @@ const NAME = "[A-Za-z0-9][A-Za-z0-9._\\-]{0,59}";
 
 /** @type {[string, string][]} */
 const SPLATS = [
-  ["ply", "PLY, exact, with labels as columns"],
+  ["ply", "PLY, exact, with labels"],
   ["compressed.ply", "Compressed PLY"],
   ["splat", ".splat"],
   ["spz", "SPZ"],

@@ -237,6 +237,7 @@ export class MoveTool {
     const about = motion ? add(subject.about, motion.translation) : subject.about;
     const middle = stage.css(about);
     if (middle.depth <= 0) return;
+    const right = stage.box.clientWidth;
     const { features } = this.app.store;
     if (motion && subject.radius > 0 && !features.has("preview")) {
       this.drawGhost(g, subject, motion);
@@ -246,7 +247,7 @@ export class MoveTool {
       const path = new Path2D();
       path.arc(middle.x, middle.y, LENGTH * factor, 0, 2 * Math.PI);
       stroke(g, path, this.near === FREE || motion ? "#ffffff" : this.app.accent, 2.5);
-      if (motion) label(g, middle.x, middle.y, `× ${factor.toFixed(2)}`);
+      if (motion) label(g, middle.x, middle.y, `× ${factor.toFixed(2)}`, right);
       return;
     }
     for (const [index, line] of this.lines(about).entries()) {
@@ -270,9 +271,10 @@ export class MoveTool {
     }
     if (motion && this.kind === "rotate") {
       const angle = (2 * Math.acos(Math.min(1, Math.abs(motion.rotation[0]))) * 180) / Math.PI;
-      label(g, middle.x, middle.y, `${angle.toFixed(0)}°`);
+      label(g, middle.x, middle.y, `${angle.toFixed(0)}°`, right);
     } else if (motion) {
-      label(g, middle.x, middle.y, motion.translation.map((part) => part.toFixed(2)).join("  "));
+      const parts = motion.translation.map((part) => part.toFixed(2));
+      label(g, middle.x, middle.y, parts.join("  "), right);
     }
   }
 
@@ -376,16 +378,19 @@ function arrowHead(g, from, to, colour) {
   g.restore();
 }
 
-/** @param {CanvasRenderingContext2D} g @param {number} x @param {number} y @param {string} text */
-function label(g, x, y, text) {
+/** Words beside a handle, within the canvas. @param {CanvasRenderingContext2D} g
+ * @param {number} x @param {number} y @param {string} text @param {number} right Edge. */
+function label(g, x, y, text, right) {
   g.font = "600 12px system-ui, 'DejaVu Sans', sans-serif";
   const width = g.measureText(text).width + 14;
+  const left = Math.max(4, Math.min(x + 14, right - width - 4));
+  const top = Math.max(4, y - 34);
   g.fillStyle = "rgb(16 18 22 / 0.82)";
   g.beginPath();
-  g.roundRect(x + 14, y - 34, width, 22, 6);
+  g.roundRect(left, top, width, 22, 6);
   g.fill();
   g.fillStyle = "#ffffff";
   g.textBaseline = "middle";
   g.textAlign = "left";
-  g.fillText(text, x + 21, y - 22.5);
+  g.fillText(text, left + 7, top + 11.5);
 }

@@ -1,7 +1,7 @@
 /** Sphere: a brush that takes what is in balls on a surface. */
 
 import { clamp } from "../dom.js";
-import { sketch } from "../stage/overlay.js";
+import { sketch, trail } from "../stage/overlay.js";
 
 /**
  * @typedef {import("../main.js").App} App
@@ -111,16 +111,7 @@ export class SphereTool {
   /** @param {CanvasRenderingContext2D} g */
   draw(g) {
     const { press, radius } = this;
-    if (press) {
-      g.globalAlpha = 0.35;
-      g.strokeStyle = this.app.accent;
-      g.lineWidth = 2 * radius;
-      g.beginPath();
-      g.moveTo(press.points[0].x, press.points[0].y);
-      for (const { x, y } of [...press.points, this.at ?? press.points[0]]) g.lineTo(x, y);
-      g.stroke();
-      g.globalAlpha = 1;
-    }
+    if (press) trail(g, press.points, 2 * radius);
     if (!this.at) return;
     const path = new Path2D();
     path.arc(this.at.x, this.at.y, radius, 0, 2 * Math.PI);
