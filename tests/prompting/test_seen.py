@@ -202,12 +202,19 @@ def test_a_view_of_what_an_edit_made_speaks_of_the_rows_before_it(gaussians, vie
         assert not views.inside(nearer).any(), "what is not shown is nowhere"
 
 
-def test_views_of_another_edit_are_prepared_anew(gaussians, view) -> None:
+def test_views_of_another_edit_are_prepared_anew_and_those_before_let_go(
+    gaussians, view, side
+) -> None:
     edits = [Edited.unchanged(gaussians), Edited.unchanged(gaussians)]
-    with ViewCache(gaussians, backend="cpu", edited=lambda _: edits[-1]) as views:
-        first = views.prepared(view)
+
+    def shown(one: View | None) -> Edited | None:
+        return None if one is side else edits[-1]
+
+    with ViewCache(gaussians, backend="cpu", edited=shown) as views:
+        plain, first = views.prepared(side), views.prepared(view)
         assert views.prepared(view) is first
-        last = edits.pop()
+        assert len(views) == 2
+        edits.pop()
         assert views.prepared(view) is not first
-        edits.append(last)
-        assert views.prepared(view) is first
+        assert len(views) == 2
+        assert views.prepared(side) is plain

@@ -110,6 +110,11 @@ class ViewCache:
             return self._views[key][2]
         shown = self._gaussians if edited is None else edited.gaussians
         made = prepare(shown, view.camera, backend=self._backend)
+        if edited is not None:
+            # An edit that was undone or went on holds a scene of Gaussians; it is let go.
+            for other, (_, before, _) in list(self._views.items()):
+                if before is not None and before is not edited:
+                    self._views.pop(other)[2].close()
         self._views[key] = (view.camera, edited, made)
         while len(self._views) > self._capacity:
             self._views.popitem(last=False)[1][2].close()

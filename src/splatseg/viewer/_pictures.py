@@ -51,7 +51,10 @@ class Pictures:
         if self._edited is None or self._edited[0] != edits:
             self.close()
             scene = self._session.edited_scene()
-            self._edited = edits, Drawer(scene, backend=self._scene_drawer.backend)
+            self._edited = (
+                edits,
+                Drawer(scene, backend=self._scene_drawer.backend, views=self._session.views),
+            )
         return self._edited[1]
 
     def close(self) -> None:
