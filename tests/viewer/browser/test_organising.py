@@ -38,7 +38,13 @@ def test_keep(tab) -> None:
     tab.row("mug").wait_for()
     assert counts(tab) == {"mug": pytest.approx(EACH, abs=15)}
     assert tab.selection is None
+    sent = len(tab.sent)
+    tab.page.locator("#level").fill("1")
+    tab.pause(250)
+    assert "select" not in [one["type"] for one in tab.sent[sent:]], "what was kept is over"
+    tab.page.locator("#level").fill("0.5")
     tab.click(BLUE)
+    tab.page.locator("#overlay").focus()
     tab.after(lambda: tab.key("Enter"))
     assert set(counts(tab)) == {"mug", "Object 2"}
 

@@ -393,6 +393,8 @@ export class App {
     let count = this.store.document.objects.length + 1;
     while (names.has(`Object ${count}`)) count += 1;
     this.keeping = this.command("keep", { name: name || `Object ${count}` });
+    // The prompt is over: its points go, and the level is of the next one.
+    if (this.keeping) this.gestures.forget();
   }
 
   enter() {
