@@ -14,8 +14,8 @@ import pytest
 import tyro
 
 from splatseg.cli import COMMANDS
-from splatseg.cli._parse import flowing, parse
-from splatseg.cli._words import FOLDER, listed, option_value, stored_page, with_flags, wrapped
+from splatseg.cli._parse import flowing, parse, wrapped
+from splatseg.cli._words import FOLDER, listed, option_value, stored_page, with_flags
 from splatseg.core.options import options
 from splatseg.errors import InputError
 

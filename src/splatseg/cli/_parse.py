@@ -5,13 +5,27 @@ the source, and writes ``{None}|STR`` for an optional word; so it is given a cop
 which both are as a person wants to read them, and its answer is copied back.
 """
 
+import contextlib
 import dataclasses
 import inspect
+import io
+import os
 import re
+import textwrap
 import types
 from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, Union, cast, get_args, get_origin, get_type_hints
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    Literal,
+    Union,
+    cast,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import docstring_parser
 import tyro
@@ -20,6 +34,12 @@ from splatseg.cli._words import names_as_flags, option_names
 from splatseg.core.options import removed_options
 from splatseg.core.typed_text import REPEATED
 from splatseg.errors import InputError, quoted
+
+if TYPE_CHECKING:
+    from splatseg.cli import CommandEntry
+
+_WIDTH = 80
+"""Columns of a kept page of help."""
 
 _SHARED = ("seed", "backend", "data", "json", "quiet")
 _ITEMS = {str: "names", int: "whole numbers", float: "numbers"}
@@ -250,3 +270,42 @@ def _placeholder(kind: Any) -> str | None:
     if (item := _item_of(kind)) is not None:
         return f"{_PLACEHOLDERS[item]} .."
     return _PLACEHOLDERS.get(kind)
+
+
+def rendered_page(name: str, entry: "CommandEntry", words: Sequence[str] = ()) -> str:
+    """The help of a command, 80 columns wide.
+
+    Args:
+        name: The command.
+        entry: Where it is.
+        words: Further words that the help depends on, such as the method's.
+    """
+    kind, config = entry.kind_for(words)
+    printed = io.StringIO()
+    before = os.environ.get("COLUMNS")
+    os.environ["COLUMNS"] = str(_WIDTH)
+    try:
+        with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
+            parse(kind, [*words, "--help"], prog=f"splatseg {name}", config=config)
+    finally:
+        if before is None:
+            del os.environ["COLUMNS"]
+        else:
+            os.environ["COLUMNS"] = before
+    return wrapped(printed.getvalue())
+
+
+def wrapped(page: str) -> str:
+    """A page without lines that are too long, blanks at their ends or two empty lines in a row.
+
+    The heading of options within a method's options names them alone, as their flags do.
+    """
+    lines: list[str] = []
+    for line in re.sub(r"(?m)^ options\.(?=\w+ options *$)", " ", page).rstrip().splitlines():
+        if not line.strip() and lines and not lines[-1]:
+            continue
+        # A command line is to be copied in one piece.
+        long = len(line) > _WIDTH and not line.startswith("splatseg ")
+        further = "  " if line.startswith("- ") else ""
+        lines += textwrap.wrap(line, _WIDTH, subsequent_indent=further) if long else [line.rstrip()]
+    return "\n".join(lines) + "\n"

@@ -4,21 +4,14 @@ To make a page takes all the imports of a command, to show it none. ``scripts/he
 them, and a test holds them equal to what the parser says.
 """
 
-import contextlib
-import io
-import os
 import re
-import textwrap
 from collections.abc import Collection, Sequence
 from dataclasses import fields, is_dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast, get_type_hints
+from typing import Any, cast, get_type_hints
 
 from splatseg.errors import InputError
-
-if TYPE_CHECKING:
-    from splatseg.cli import CommandEntry
 
 _QUOTED = re.compile(r"`(\w+)`")
 _NAMED = re.compile(r"^(\w+(?:, \w+)*): ")
@@ -97,7 +90,6 @@ def _flag(name: str) -> str:
 
 
 FOLDER = Path(__file__).parent / "pages"
-_WIDTH = 80
 _HELP = ("--help", "-h")
 KINDS = {"segment": "--method", "see": "--model"}
 """Commands whose options depend on the value of one of them."""
@@ -127,47 +119,6 @@ def stored_page(name: str, words: Sequence[str]) -> str | None:
     if path.parent != FOLDER or not path.is_file():
         return None
     return path.read_text(encoding="utf-8")
-
-
-def rendered_page(name: str, entry: "CommandEntry", words: Sequence[str] = ()) -> str:
-    """The help of a command, 80 columns wide.
-
-    Args:
-        name: The command.
-        entry: Where it is.
-        words: Further words that the help depends on, such as the method's.
-    """
-    from splatseg.cli._parse import parse
-
-    kind, config = entry.kind_for(words)
-    printed = io.StringIO()
-    before = os.environ.get("COLUMNS")
-    os.environ["COLUMNS"] = str(_WIDTH)
-    try:
-        with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
-            parse(kind, [*words, "--help"], prog=f"splatseg {name}", config=config)
-    finally:
-        if before is None:
-            del os.environ["COLUMNS"]
-        else:
-            os.environ["COLUMNS"] = before
-    return wrapped(printed.getvalue())
-
-
-def wrapped(page: str) -> str:
-    """A page without lines that are too long, blanks at their ends or two empty lines in a row.
-
-    The heading of options within a method's options names them alone, as their flags do.
-    """
-    lines: list[str] = []
-    for line in re.sub(r"(?m)^ options\.(?=\w+ options *$)", " ", page).rstrip().splitlines():
-        if not line.strip() and lines and not lines[-1]:
-            continue
-        # A command line is to be copied in one piece.
-        long = len(line) > _WIDTH and not line.startswith("splatseg ")
-        further = "  " if line.startswith("- ") else ""
-        lines += textwrap.wrap(line, _WIDTH, subsequent_indent=further) if long else [line.rstrip()]
-    return "\n".join(lines) + "\n"
 
 
 def default_config() -> tuple[Any, ...]:
