@@ -160,16 +160,14 @@ class SceneAnswers:
 
     def _changed(self, old: Document, new: Document, author: str) -> None:
         """Tell all pages of a change, and draw it."""
+        # First: what a page asks for once it knows of the change is meant as it is.
+        self._worker.redraw(author)
+        history = self._session.history
         self._worker.broadcast(
             self._mirror.patch(
-                old,
-                new,
-                undo=self._session.history.undo_label,
-                redo=self._session.history.redo_label,
-                author=author,
+                old, new, undo=history.undo_label, redo=history.redo_label, author=author
             )
         )
-        self._worker.redraw(author)
 
     # Pictures.
 
