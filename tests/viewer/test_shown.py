@@ -113,6 +113,7 @@ def test_turned_and_larger(session, ids) -> None:
 
 
 def test_strokes_and_boxes(session, ids) -> None:
+    edit(session, ids, "remove", field=3)
     edit(session, ids, "move", translation=UP)
     scribble = torch.zeros(30, 40, dtype=torch.bool)
     scribble[4:7, 8:16] = True
