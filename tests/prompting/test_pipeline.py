@@ -206,13 +206,14 @@ def test_a_mask_confirms_what_the_view_shows_after_an_edit(gaussians, view) -> N
     views = ViewCache(gaussians, backend="cpu", edited=lambda _: edited)
     (prompt,) = see_prompts(gaussians, [ViewPrompt(view=view, mask=mask)], views=views)
     context = replace(shown(gaussians, view, "features", mask=mask), views=views, prompts=(prompt,))
-    kept = filtered(torch.full((len(gaussians),), 0.9), context) > 0.5
+    confirmed, ruled_out = pipeline._by_masks(context)
     column = 25 + 10 * gaussians.means[:, 0]
     row = 10 + 10 * gaussians.means[:, 1]
     left = torch.zeros(len(gaussians), dtype=torch.bool)
     left[rows] = True
-    assert kept[left & (column > 4) & (column < 16) & (row > 12) & (row < 18)].all()
-    assert not kept[left & (column > 20) & (column < 34) & (row > 12) & (row < 28)].any()
+    assert confirmed[left & (column > 4) & (column < 16) & (row > 12) & (row < 18)].all()
+    assert ruled_out[left & (column > 20) & (column < 34) & (row > 12) & (row < 28)].all()
+    assert not (confirmed | ruled_out)[~left].any()
 
 
 def test_features_alone_grow_among_what_is_nearly_similar(gaussians, view, field) -> None:
