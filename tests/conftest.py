@@ -60,8 +60,13 @@ def project_root() -> Path:
 
 @pytest.fixture(autouse=True)
 def _draws_begin_anew() -> None:
-    """Torch draws the same numbers in a test, whatever ran before it."""
-    torch.manual_seed(20240817)
+    """Torch draws the same numbers in a test, whatever ran before it.
+
+    Of the processor: `torch.manual_seed` formats the stack of calls each time, for a GPU to come.
+    """
+    torch.default_generator.manual_seed(20240817)
+    if torch.cuda.is_initialized():
+        torch.cuda.manual_seed_all(20240817)
 
 
 @pytest.fixture(autouse=True)

@@ -1,9 +1,6 @@
 """Real processes, killed at any moment: nothing is corrupted, and the end is the same."""
 
-import os
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -15,6 +12,7 @@ from splatseg.fit import checkpoint_summary
 from splatseg.io.scene import load_scene
 from splatseg.io.scene_folder import CHECKPOINT_FILE, is_scene, is_unfinished
 from splatseg.synthetic import cameras, room, write_capture
+from support.forked import Forked
 
 STEPS = 150
 EVERY = 4
@@ -31,22 +29,15 @@ def capture_folder(tmp_path_factory) -> Path:
     return folder
 
 
-def _begin(capture: Path, scene: Path, *words: str) -> subprocess.Popen[str]:
-    program = "import sys, splatseg.cli; sys.exit(splatseg.cli.main())"
-    command = ["fit", str(capture), "-o", str(scene), "--steps", str(STEPS)]
-    more = ["--max-gaussians", "3000", "--checkpoint-steps", str(EVERY)]
-    return subprocess.Popen(
-        [sys.executable, "-c", program, *command, *more, *words],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=os.environ | {"OMP_NUM_THREADS": "1", "SPLATSEG_THREADS": "1"},
-    )
+def _begin(capture: Path, scene: Path, *words: str, every: int = EVERY) -> Forked:
+    command = ["fit", capture, "-o", scene, "--steps", STEPS]
+    return Forked(*command, "--max-gaussians", 3000, "--checkpoint-steps", every, *words)
 
 
-def _ended(process: subprocess.Popen[str]) -> tuple[int, str, str]:
-    out, err = process.communicate(timeout=300)
-    return process.returncode, out, err
+def _ended(process: Forked) -> tuple[int, str, str]:
+    with process:
+        out, err = process.communicate()
+        return process.wait(), out, err
 
 
 def _steps(scene: Path) -> int:
@@ -57,7 +48,7 @@ def _steps(scene: Path) -> int:
         return 0
 
 
-def _wait_for(process: subprocess.Popen[str], scene: Path, steps: int) -> None:
+def _wait_for(process: Forked, scene: Path, steps: int) -> None:
     deadline = time.monotonic() + 120
     while _steps(scene) < steps and process.poll() is None:
         assert time.monotonic() < deadline, "no progress"
@@ -109,7 +100,7 @@ def test_killed_at_any_moment_nothing_is_lost(
 
 def test_killed_before_the_first_checkpoint(capture_folder: Path, tmp_path: Path) -> None:
     scene = tmp_path / "scene"
-    process = _begin(capture_folder, scene)
+    process = _begin(capture_folder, scene, every=STEPS)
     time.sleep(0.3)
     process.send_signal(signal.SIGKILL)
     _ended(process)

@@ -40,7 +40,9 @@ def run(folder: Path, project_root: Path, monkeypatch, ends: str, *words: str) -
     (folder / "pytest.ini").write_text(f"[pytest]\npythonpath = {project_root / 'tests'}\n")
     for name in ("PYTEST_XDIST_WORKER", "PYTEST_ADDOPTS", "BROKEN"):
         monkeypatch.delenv(name, raising=False)
-    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-ra", *words]
+    monkeypatch.setenv("PYTEST_DISABLE_PLUGIN_AUTOLOAD", "1")  # the others take long to import
+    plugins = ("-p", "xdist", "-p", "no:cacheprovider")
+    command = [sys.executable, "-m", "pytest", *plugins, "-ra", *words]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     return done.returncode, done.stderr + done.stdout
 

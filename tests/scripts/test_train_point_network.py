@@ -78,16 +78,28 @@ def test_other_domain_has_no_say(script):
     assert float(shares[1, : script.ROOMS].sum()) == 0
 
 
+def often_kept(script, patch):
+    """A checkpoint every second step."""
+    patch.setattr(script, "CHECKPOINT_EVERY", 2)
+    patch.setattr(script, "CALIBRATION", 2)
+
+
+@pytest.fixture(scope="module")
+def whole(script, recipe, clouds, tmp_path_factory):
+    """What a training gives that nobody interrupts."""
+    with one_torch_thread(), pytest.MonkeyPatch.context() as patch:
+        often_kept(script, patch)
+        return script.train(recipe, clouds, tmp_path_factory.mktemp("whole"))[0]
+
+
 @pytest.mark.parametrize("at", [3, 8])
-def test_what_was_interrupted_ends_the_same(script, recipe, clouds, at, tmp_path, monkeypatch):
+def test_what_was_interrupted_ends_the_same(
+    script, whole, recipe, clouds, at, tmp_path, monkeypatch
+):
     """In the first part, and in the second, which begins at step 4 + 2. One thread, as the script
     trains by default: torch adds gradients up by its threads in any order."""
-    monkeypatch.setattr(script, "CHECKPOINT_EVERY", 2)
-    monkeypatch.setattr(script, "CALIBRATION", 2)
-    (tmp_path / "a").mkdir()
-    (tmp_path / "b").mkdir()
+    often_kept(script, monkeypatch)
     with one_torch_thread():
-        whole, _ = script.train(recipe, clouds, tmp_path / "a")
         drawn = script.drawn
 
         def stop(clouds, recipe, step):
@@ -98,12 +110,12 @@ def test_what_was_interrupted_ends_the_same(script, recipe, clouds, at, tmp_path
         with monkeypatch.context() as patch:
             patch.setattr(script, "drawn", stop)
             with pytest.raises(KeyboardInterrupt):
-                script.train(recipe, clouds, tmp_path / "b")
-        resumed, _ = script.train(recipe, clouds, tmp_path / "b")
+                script.train(recipe, clouds, tmp_path)
+        resumed, _ = script.train(recipe, clouds, tmp_path)
     for name, tensor in whole.state_dict().items():
         assert torch.equal(tensor, resumed.state_dict()[name]), name
     with pytest.raises(SystemExit, match="another recipe"):
-        script.train(replace(recipe, seed=1), clouds, tmp_path / "b")
+        script.train(replace(recipe, seed=1), clouds, tmp_path)
 
 
 def test_scores_are_of_the_classes_that_are_there(script, recipe, clouds):

@@ -5,7 +5,6 @@ import os
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -28,6 +27,7 @@ from splatseg.io.evidence import (
 )
 from splatseg.io.scene import load_scene, save_scene, save_scene_layer
 from support.browser_handles import TOUCHES
+from support.forked import Forked
 from support.viewer import EACH, HEIGHT, MATRIX, WIDTH, Page, write_scene
 
 RED, BLUE, GREEN = (-1.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 3.0, 1.5)
@@ -91,15 +91,8 @@ class Serving:
 
     def __init__(self, scene: Path, log: Path, *, port: int = 0) -> None:
         self.scene = scene
-        words = ["view", scene, "--no-open", "--json", "--backend", "cpu", "--port", port]
-        command = [sys.executable, "-m", "splatseg", *map(str, words)]
-        with log.open("a") as errors:
-            self.process = subprocess.Popen(
-                command, stdout=subprocess.PIPE, stderr=errors, text=True,
-                env={**os.environ, "OMP_NUM_THREADS": "1"},
-            )  # fmt: skip
-        if self.process.stdout is None:
-            raise RuntimeError("no output")
+        words = ("view", scene, "--no-open", "--json", "--backend", "cpu", "--port", port)
+        self.process = Forked(*words, log=log)
         line = self.process.stdout.readline()
         if not line:
             raise RuntimeError(log.read_text())
@@ -125,8 +118,7 @@ class Serving:
         except subprocess.TimeoutExpired:
             self.process.kill()
             self.process.wait()
-        if self.process.stdout is not None:
-            self.process.stdout.close()
+        self.process.close()
 
     def client(self) -> Page:
         """Somebody else who looks at the scene, without a browser; has the state."""

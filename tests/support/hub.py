@@ -1,6 +1,7 @@
 """A Hugging Face hub of one machine: what the real library asks of the real one, over HTTP."""
 
 import hashlib
+import importlib
 import json
 import threading
 from collections.abc import Generator
@@ -9,6 +10,8 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
+
+import pytest
 
 REVISION = "0123456789abcdef0123456789abcdef01234567"
 
@@ -66,6 +69,31 @@ def local_hub(repositories: dict[str, Path], *, gated: tuple[str, ...] = ()) -> 
     finally:
         server.shutdown()
         server.server_close()
+
+
+@contextmanager
+def in_place_of_the_real(hub: Any, home: Path) -> Generator[None]:
+    """The library of this process asks a hub of `local_hub`, and keeps what it gets below a folder.
+
+    As HF_ENDPOINT, HF_HOME and others would do, which it reads once, when it is imported.
+    """
+    settings = {
+        "ENDPOINT": hub.url,
+        "HUGGINGFACE_CO_URL_TEMPLATE": hub.url + "/{repo_id}/resolve/{revision}/{filename}",
+        "HF_HUB_CACHE": str(home / "hub"),
+        "HF_XET_CACHE": str(home / "xet"),
+        "HF_TOKEN_PATH": str(home / "token"),
+        "HF_HUB_OFFLINE": False,
+        "HF_HUB_DISABLE_XET": True,
+        "HF_HUB_DISABLE_TELEMETRY": True,
+    }
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in settings.items():
+            patch.setattr(f"huggingface_hub.constants.{name}", value)
+        try:
+            yield
+        finally:
+            importlib.import_module("huggingface_hub").close_session()
 
 
 def _tree(folder: Path) -> list[dict[str, Any]]:

@@ -1,10 +1,8 @@
 """`splatseg view`: scenes, splat files, fits that run; its link, and its end."""
 
 import json
-import os
 import shutil
 import signal
-import subprocess
 import sys
 import tempfile
 import threading
@@ -27,26 +25,20 @@ from splatseg.io.scene_folder import CHECKPOINT_FILE
 from splatseg.io.splats import write_splats
 from splatseg.viewer import _fitting
 from splatseg.viewer._server import ViewServer
+from support.forked import Forked
 from support.viewer import EACH, RED_PIXEL, WIDTH, Page, opened
 
 
 @contextmanager
-def running(*words: object) -> Iterator[tuple[dict[str, Any], "subprocess.Popen[str]"]]:
+def running(*words: object) -> Iterator[tuple[dict[str, Any], Forked]]:
     """The command in a process of its own, once it has printed its link."""
-    command = [sys.executable, "-m", "splatseg", "view", *map(str, words), "--no-open", "--json"]
-    process = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-    )  # fmt: skip
-    with process:
+    with Forked("view", *words, "--no-open", "--json") as process:
         try:
-            assert process.stdout is not None
             line = process.stdout.readline()
             assert line, process.communicate()[1]
             yield json.loads(line), process
         finally:
-            if process.poll() is None:
-                process.kill()
+            process.kill()
 
 
 def entered(facts: dict[str, Any]) -> Page:
@@ -75,11 +67,11 @@ def meanwhile(monkeypatch: pytest.MonkeyPatch, look: Callable[[Page], None]) -> 
     monkeypatch.setattr(ViewServer, "wait", wait)
 
 
-def ended(process: "subprocess.Popen[str]", number: int = signal.SIGINT) -> tuple[int, str]:
+def ended(process: Forked, number: int = signal.SIGINT) -> tuple[int, str]:
     """The status and the errors of a process that a signal ends."""
     process.send_signal(number)
     _, errors = process.communicate(timeout=120)  # of a machine that does much else
-    return process.returncode, errors
+    return process.wait(), errors
 
 
 def test_a_scene_is_served_until_ctrl_c_and_kept(things) -> None:

@@ -7,6 +7,7 @@ which both are as a person wants to read them, and its answer is copied back.
 
 import contextlib
 import dataclasses
+import functools
 import inspect
 import io
 import os
@@ -224,16 +225,23 @@ def _texts(command: type[Any]) -> dict[str, str]:
     """The string below each field, flowing; a subclass's before its base's."""
     found: dict[str, str] = {}
     for cls in reversed(command.__mro__):
-        if not dataclasses.is_dataclass(cls):
-            continue
-        try:
-            parsed = docstring_parser.parse_from_object(cls)
-        except (OSError, TypeError):  # made at run time: it has no source
-            continue
-        for entry in parsed.params:
-            if entry.description is not None:
-                found[entry.arg_name] = flowing(entry.description)
+        if dataclasses.is_dataclass(cls) and cls.__module__ != types.__name__:
+            found |= _texts_below(cls)  # others were made at run time: they have no source
     return found
+
+
+@functools.cache
+def _texts_below(cls: type[Any]) -> dict[str, str]:
+    """The string below each field of a class; read once, for many commands share their bases."""
+    try:
+        parsed = docstring_parser.parse_from_object(cls)
+    except (OSError, TypeError):  # it has no source
+        return {}
+    return {
+        entry.arg_name: flowing(entry.description)
+        for entry in parsed.params
+        if entry.description is not None
+    }
 
 
 def _item_of(kind: Any) -> type[str] | type[int] | type[float] | None:

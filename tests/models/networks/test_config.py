@@ -26,7 +26,7 @@ from splatseg.models.networks._config import (
     offline,
 )
 from splatseg.models.networks._library import side_of
-from support.networks import IMAGE, KINDS, asked, checkpoint, in_parts
+from support.networks import IMAGE, KINDS, asked, copied, in_parts
 
 
 @pytest.fixture
@@ -147,7 +147,7 @@ def test_no_key_is_of_two_kinds() -> None:
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_nothing_is_asked_of_the_network(name, tmp_path, monkeypatch) -> None:
+def test_nothing_is_asked_of_the_network(name, checkpoints, tmp_path, monkeypatch) -> None:
     """Whatever the file names, and though the library of the hub was imported online."""
     seen: list[object] = []
 
@@ -159,8 +159,7 @@ def test_nothing_is_asked_of_the_network(name, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(socket, "getaddrinfo", refuse)
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", False)
     family, kind = KINDS[name]
-    folder = checkpoint(family, kind, tmp_path)
-    asked(family, folder)
+    folder = copied(family, checkpoints(kind), tmp_path)
     file = folder / "config.json"
     content = json.loads(file.read_text())
     hostile = {"backbone": "someone/network", "use_timm_backbone": False,
@@ -171,7 +170,7 @@ def test_nothing_is_asked_of_the_network(name, tmp_path, monkeypatch) -> None:
         value for value in content.values() if isinstance(value, dict) and "model_type" in value
     ]
     for part in (content, *parts):
-        for without in ((), ("backbone_config",)):
+        for without in ((), *((name,) for name in ("backbone_config",) if name in part)):
             kept = {key: part.pop(key) for key in without if key in part}
             added = {key: hostile[key] for key in hostile if key not in part}
             part.update(added)
@@ -504,7 +503,7 @@ except Exception:
 """
 
 
-def test_kernels_are_never_called(tmp_path) -> None:
+def test_kernels_are_never_called(checkpoints, tmp_path) -> None:
     from transformers.utils.import_utils import KERNELS_MIN_VERSION
 
     packages = tmp_path / "packages"
@@ -518,7 +517,10 @@ def test_kernels_are_never_called(tmp_path) -> None:
         f"Metadata-Version: 2.1\nName: kernels\nVersion: {KERNELS_MIN_VERSION}\n"
     )
     names = [name for name in KINDS if name != "dinov2"] + ["dinov2"]
-    folders = [(KINDS[name][0], str(checkpoint(*KINDS[name], tmp_path))) for name in names]
+    folders = [
+        (family, str(copied(family, checkpoints(kind), tmp_path)))
+        for family, kind in (KINDS[name] for name in names)
+    ]
     tests = str(Path(support.__path__[0]).parent)
     paths = os.pathsep.join([str(packages), tests, os.environ.get("PYTHONPATH", "")])
     done = subprocess.run(

@@ -2,10 +2,7 @@
 
 import hashlib
 import json
-import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -13,14 +10,7 @@ import pytest
 from splatseg.errors import BackendError, FileFormatError, InputError, MissingFileError, RangeError
 from splatseg.models import LoadOptions, find_family, find_model
 from splatseg.models._weights import digest_of, weight_files
-from support.hub import local_hub
-
-LOAD = """
-import sys
-from splatseg.models import LoadOptions, find_model
-options = LoadOptions(weights=sys.argv[1], download=sys.argv[2] == "yes", device="cpu")
-print(find_model("dinov2", loading=options, report=print).note)
-"""
+from support.hub import in_place_of_the_real, local_hub
 
 
 def load(**options) -> object:
@@ -118,26 +108,25 @@ def test_fetching_says_what_and_how_much_and_only_when_asked(checkpoints, tmp_pa
     (folder / "README.md").write_text("a card")
 
     def run(id: str, download: str) -> str:
-        environment = {
-            **os.environ, "HF_ENDPOINT": hub.url, "HF_HOME": str(tmp_path / "home"),
-            "HF_HUB_OFFLINE": "0", "HF_HUB_DISABLE_XET": "1", "HF_HUB_DISABLE_TELEMETRY": "1",
-        }  # fmt: skip
-        done = subprocess.run(
-            [sys.executable, "-c", LOAD, id, download],
-            capture_output=True, text=True, env=environment,
-        )  # fmt: skip
-        return done.stdout if not done.returncode else done.stderr.strip().splitlines()[-1]
+        said: list[str] = []
+        options = LoadOptions(weights=id, download=download == "yes", device="cpu")
+        try:
+            said.append(find_model("dinov2", loading=options, report=said.append).note)
+        except MissingFileError as error:
+            return str(error)
+        return "\n".join(said)
 
-    with local_hub({"tiny/dinov2": folder}, gated=("tiny/gated",)) as hub:
+    hubs = local_hub({"tiny/dinov2": folder}, gated=("tiny/gated",))
+    with hubs as hub, in_place_of_the_real(hub, tmp_path / "home"):
         assert "is not on this machine" in run("tiny/dinov2", "no")
         assert not hub.asked, "nothing is asked without leave"
         said = run("tiny/dinov2", "yes")
         size = sum((folder / name).stat().st_size for name in ("config.json", "model.safetensors"))
         assert f"fetching {size / 1e6:.0f} MB from the Hugging Face hub, licence apache-2.0" in said
-        assert said.endswith("weights tiny/dinov2\n")
+        assert said.endswith("\nweights tiny/dinov2")
         assert not any("pytorch_model" in path or "README" in path for path in hub.asked)
         hub.asked.clear()
-        assert run("tiny/dinov2", "no") == "weights tiny/dinov2\n", "it is in the cache now"
+        assert run("tiny/dinov2", "no") == "weights tiny/dinov2", "it is in the cache now"
         assert not hub.asked
         config = next((tmp_path / "home").rglob("config.json"))
         parts = {"weight_map": {"a": "model.safetensors", "b": "model-2.safetensors"}}

@@ -1,9 +1,6 @@
 """Masks of what words mean: by hand, by Grounding DINO with SAM, and by SAM 3."""
 
-import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -31,7 +28,7 @@ from splatseg.models.networks.word_masks import (
     text_masks,
 )
 from support.checkpoints_text import COLOURS
-from support.hub import local_hub
+from support.hub import in_place_of_the_real, local_hub
 
 WORDS = ("chair", "red mug", "table")
 ALL = {"box_threshold": 0.0, "text_threshold": 0.0}
@@ -203,33 +200,16 @@ def test_second_weights_that_are_not_there(
         langsam(checkpoints, sam_model="sam2", sam_weights=weights)
 
 
-LOAD = """
-from splatseg.models import LoadOptions, find_model
-from splatseg.models.networks import grounding_dino
-from splatseg.models.networks.grounding_dino import LangSamOptions
-options = LangSamOptions(words=("chair",), sam_model="sam", sam_weights="tiny/sam")
-loading = LoadOptions(weights="tiny/detector", download=True, device="cpu")
-print(find_model("langsam", options, loading=loading, report=print).note)
-"""
-
-
 def test_second_weights_are_fetched_by_the_leave_for_the_first(checkpoints, tmp_path) -> None:
-    def run() -> str:
-        environment = {
-            **os.environ, "HF_ENDPOINT": hub.url, "HF_HOME": str(tmp_path / "home"),
-            "HF_HUB_OFFLINE": "0", "HF_HUB_DISABLE_XET": "1", "HF_HUB_DISABLE_TELEMETRY": "1",
-        }  # fmt: skip
-        done = subprocess.run(
-            [sys.executable, "-c", LOAD], capture_output=True, text=True, env=environment
-        )
-        return done.stdout if not done.returncode else done.stderr.strip().splitlines()[-1]
-
+    options = LangSamOptions(words=("chair",), sam_model="sam", sam_weights="tiny/sam")
+    loading = LoadOptions(weights="tiny/detector", download=True, device="cpu")
     both = {"tiny/detector": checkpoints("grounding_dino"), "tiny/sam": checkpoints("sam")}
-    with local_hub(both) as hub:
-        said = run()
-        assert "tiny/detector: fetching " in said
-        assert "tiny/sam: fetching " in said
-        assert said.endswith("weights tiny/detector\n")
+    said: list[str] = []
+    with local_hub(both) as hub, in_place_of_the_real(hub, tmp_path / "home"):
+        model = find_model("langsam", options, loading=loading, report=said.append)
+    assert [line.partition(" ")[0] for line in said] == ["tiny/detector:", "tiny/sam:"]
+    assert all(": fetching " in line for line in said)
+    assert model.note == "weights tiny/detector"
 
 
 # SAM 3

@@ -1,5 +1,6 @@
 """Starts the workers, restarts them past what killed them, and counts."""
 
+import gc
 import json
 import os
 import signal
@@ -15,7 +16,7 @@ from typing import Any
 import torch
 
 from support.fuzz.targets import TARGETS
-from support.fuzz.worker import work
+from support.fuzz.worker import Sound, work
 
 _START = 30
 """Seconds that a process may take to start."""
@@ -94,11 +95,11 @@ def fuzz(
     waiting, done = list(formats), list[Outcome]()
     active: list[_Run] = []
     with tempfile.TemporaryDirectory(prefix="fuzz-") as holder:
-        _import_for(formats, Path(holder))
+        sound = _read_once(formats, Path(holder))
         while waiting or active:
             while waiting and len(active) < jobs:
-                run = _Run(waiting.pop(0), range(first, first + tries), seed, limits, Path(holder))
-                active.append(run)
+                name, cases = waiting.pop(0), range(first, first + tries)
+                active.append(_Run(name, sound[name], cases, seed, limits, Path(holder)))
             time.sleep(0.02)
             for run in [run for run in active if run.poll()]:
                 active.remove(run)
@@ -107,20 +108,30 @@ def fuzz(
     return sorted(done, key=lambda outcome: formats.index(outcome.format))
 
 
-def _import_for(formats: Sequence[str], folder: Path) -> None:
-    """Read each sound file once before forking: what that imports is imported once, not once a
+def _read_once(formats: Sequence[str], holder: Path) -> dict[str, Sound]:
+    """Each sound file, read once before forking: what that imports is imported once, not once a
     process, which took most of the time of a short run."""
     torch.set_num_threads(1)  # a pool of threads would not survive the fork
-    for name in formats:
-        with tempfile.TemporaryDirectory(dir=folder) as one:
-            TARGETS[name](Path(one)).read()
+    found: dict[str, Sound] = {}
+    for number, name in enumerate(formats):
+        folder = holder / f"files-{number}"
+        folder.mkdir()
+        target = TARGETS[name](folder)
+        found[name] = Sound(folder=folder, target=target, content=target.file.read_bytes())
+        target.read()
+    gc.collect()
+    gc.freeze()  # else each process copies what its collector looks at
+    return found
 
 
 class _Run:
     """The processes of one format, one after another: each begins past what ended the last."""
 
-    def __init__(self, name: str, cases: range, seed: int, limits: Limits, holder: Path) -> None:
+    def __init__(
+        self, name: str, sound: Sound, cases: range, seed: int, limits: Limits, holder: Path
+    ) -> None:
         self.outcome = Outcome(format=name)
+        self._sound = sound
         self._said = holder / f"{name}.said"
         self._progress = holder / f"{name}.progress"
         self._job: dict[str, Any] = {"name": name, "seed": seed, **asdict(limits)}
@@ -159,7 +170,7 @@ class _Run:
         if self._pid == 0:
             status = 1
             try:
-                work(self._job)
+                work(self._job, self._sound)
                 status = 0
             except BaseException:
                 traceback.print_exc()

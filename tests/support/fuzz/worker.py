@@ -8,12 +8,12 @@ import json
 import os
 import resource
 import signal
-import tempfile
 import time
 import traceback
 import warnings
 import zlib
 from collections import Counter
+from dataclasses import dataclass
 from pathlib import Path
 from random import Random
 from types import FrameType
@@ -23,10 +23,21 @@ import torch
 
 from splatseg.errors import InputError
 from support.fuzz.mutations import mutate
-from support.fuzz.targets import TARGETS, Target
+from support.fuzz.targets import Target
 
 LONGEST = 400
 """Characters of a message beside the file's path."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sound:
+    """A format's file before it is damaged."""
+
+    folder: Path
+    """Where it and what it needs is."""
+
+    target: Target
+    content: bytes
 
 
 class TooSlowError(BaseException):
@@ -62,7 +73,7 @@ def fault_of(target: Target, folder: Path) -> str | None:
     return None
 
 
-def work(job: dict[str, Any]) -> None:
+def work(job: dict[str, Any], sound: Sound) -> None:
     """Read cases: `job` has the format's name, seed, begin, end, limits and two files.
 
     Its process ends with it: the limits of memory are never taken back.
@@ -70,35 +81,28 @@ def work(job: dict[str, Any]) -> None:
     warnings.simplefilter("ignore")
     torch.set_num_threads(1)
     os.dup2(2, 1)  # decoders print to the standard output, where the counts are JSON
-    with tempfile.TemporaryDirectory(prefix="fuzz-") as holder, Path(job["said"]).open("w") as said:
-        folder = Path(holder) / "files"
-        folder.mkdir()
-        target = TARGETS[job["name"]](folder)
-        sound = target.file.read_bytes()
-        target.read()
+    with Path(job["said"]).open("w") as said:
         before = _peak()
         size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (size + (job["memory"] << 20),) * 2)
         signal.signal(signal.SIGPROF, _too_slow)
-        families = _cases(job, target, sound, folder, said)
+        families = _cases(job, sound, said)
         _say(said, {"tries": families, "peak": max(0, _peak() - before)})
 
 
-def _cases(
-    job: dict[str, Any], target: Target, sound: bytes, folder: Path, said: IO[str]
-) -> dict[str, int]:
+def _cases(job: dict[str, Any], sound: Sound, said: IO[str]) -> dict[str, int]:
     families: Counter[str] = Counter()
     with Path(job["progress"]).open("wb", buffering=0) as progress:
         for index in range(job["begin"], job["end"]):
             progress.seek(0)
             progress.write(f"{index:12d}".encode())
-            family, damaged = case(job["name"], job["seed"], index, sound)
+            family, damaged = case(job["name"], job["seed"], index, sound.content)
             families[family] += 1
-            target.file.write_bytes(damaged)
+            sound.target.file.write_bytes(damaged)
             began = time.process_time()
             signal.setitimer(signal.ITIMER_PROF, job["seconds"])
             try:
-                fault = fault_of(target, folder)
+                fault = fault_of(sound.target, sound.folder)
             except TooSlowError:  # between the end of reading and that of the clock
                 fault = "hang"
             signal.setitimer(signal.ITIMER_PROF, 0)
