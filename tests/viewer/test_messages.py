@@ -51,6 +51,16 @@ def test_each_type_is_a_class_of_its_own(value, kind) -> None:
     assert type(parsed(value)) is kind
 
 
+def test_a_camera_may_show_a_move_under_way() -> None:
+    plain = parsed(DRAW)
+    assert isinstance(plain, messages.DrawRequest)
+    assert plain.preview is None
+    motion = {"ids": None, "translation": [1, 2, 3], "scale": 2, "about": [0, 0, 1]}
+    moved = parsed({**DRAW, "preview": motion})
+    assert isinstance(moved, messages.DrawRequest)
+    assert moved.preview == messages.Move(translation=(1, 2, 3), scale=2, about=(0, 0, 1))
+
+
 def test_defaults_are_those_of_the_protocol() -> None:
     drawn, selected = parsed(DRAW), parsed(SELECT)
     assert isinstance(drawn, messages.DrawRequest)
@@ -89,6 +99,10 @@ REFUSED = {
     "a far place": {**DRAW, "matrix": [1, 0, 0, 1e300, *EYE[4:]]},
     "another mode": {**DRAW, "mode": "../secret"},
     "an object below 0": {**DRAW, "only": -5},
+    "a preview of another form": {**DRAW, "preview": {"colour": [1, 2, 3]}},
+    "a preview of no size": {**DRAW, "preview": {"scale": 0}},
+    "a preview turned by nothing": {**DRAW, "preview": {"rotation": [0, 0, 0, 0]}},
+    "a preview far away": {**DRAW, "preview": {"translation": [1e10, 0, 0]}},
     "another kind": {**SELECT, "kind": "everything"},
     "points of three": {**SELECT, "points": [[1, 2, 3]]},
     "too many points": {**SELECT, "points": [[1, 2]] * 4001},

@@ -113,6 +113,51 @@ def test_modes_and_one_object_alone(page) -> None:
     assert "77" in page.next("error")["text"]
 
 
+def test_pictures_of_values_have_a_legend_once_while_it_is_the_same(page) -> None:
+    ramp = page.heard[0]["ramp"]
+    assert (ramp[0], ramp[-1]) == ("#440154", "#fde725")
+    start = len(page.heard)
+    for id, mode in enumerate(("colour", "confidence", "confidence", "depth", "colour"), start=1):
+        page.still(id, mode=mode)
+    page.draw(9, mode="depth")  # in motion nothing is said
+    page.frame(9)
+    page.send("hint")
+    page.next("hint")
+    said = [one for one in page.heard[start:] if isinstance(one, dict) and one["type"] == "legend"]
+    assert [one["mode"] for one in said] == ["colour", "confidence", "depth", "colour"]
+    assert [one["ends"] for one in said[::3]] == [None, None]
+    assert said[1]["ends"] == [0, 1]
+    far, near = said[2]["ends"]
+    assert 3 < near < 4 < far < 8
+
+
+def test_a_move_under_way_is_drawn_and_nothing_is_changed(page) -> None:
+    page.select(1, points=[RED_PIXEL])
+    plain = page.still(1)
+    there = (26, 20)
+    assert plain.rgb(*RED_PIXEL)[0] > 100 > plain.rgb(*there)[0]
+    preview = {"ids": None, "translation": [0, 0, 0.8]}
+    moved = page.still(2, preview=preview)
+    assert moved.rgb(*there)[0] > 100
+    assert moved.rgb(*RED_PIXEL)[0] < 60
+    assert np.array_equal(page.still(3).bgr, plain.bgr)
+    page.command("keep", name="mug")
+    moved = page.still(4, preview=preview | {"ids": [1]})
+    assert moved.rgb(*there)[0] > 100
+    for gone in (preview, preview | {"ids": [7]}):
+        assert page.still(5, preview=gone).rgb(*RED_PIXEL)[0] > 100, "there is nothing to move"
+    page.command("select_object", id=1)
+    patch = page.command("move", translation=[0, 0, 0.8])
+    assert patch["selection"]["centre"][2] == pytest.approx(0.8, abs=0.1)
+    assert patch["objects"][0]["centre"] == patch["selection"]["centre"]
+    assert page.select(2, points=[there])["count"] == pytest.approx(EACH, abs=15)
+    page.send("undo")
+    assert page.next("patch")["objects"] == []
+    page.send("undo")
+    back = page.next("patch")["objects"][0]["centre"]
+    assert back[2] == pytest.approx(0, abs=0.1)
+
+
 def test_the_id_map_names_what_is_under_each_pixel(page) -> None:
     page.draw(1, rest=True, ids=True)
     things = page.ids()

@@ -27,10 +27,11 @@ from splatseg.io.scene_folder import scene_path
 from splatseg.render import BackendName
 from splatseg.tasks.work import EXPORTS_FOLDER, Observer
 from splatseg.viewer import _messages as messages
+from splatseg.viewer._client import Job
 from splatseg.viewer._mirror import Mirror
 from splatseg.viewer._pictures import Pictures
 from splatseg.viewer._session import Session
-from splatseg.viewer._worker import Job, Worker
+from splatseg.viewer._worker import Worker
 
 _FRAMES_A_SECOND = 24.0
 _POLL_SECONDS = 0.2

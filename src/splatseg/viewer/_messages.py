@@ -28,6 +28,7 @@ from splatseg.viewer._outgoing import Finished as Finished
 from splatseg.viewer._outgoing import FittingInfo as FittingInfo
 from splatseg.viewer._outgoing import HintAnswer as HintAnswer
 from splatseg.viewer._outgoing import HomeInfo as HomeInfo
+from splatseg.viewer._outgoing import Legend as Legend
 from splatseg.viewer._outgoing import ObjectInfo as ObjectInfo
 from splatseg.viewer._outgoing import Outgoing as Outgoing
 from splatseg.viewer._outgoing import Patch as Patch
@@ -48,7 +49,7 @@ from splatseg.viewer._outgoing import frame_bytes as frame_bytes
 from splatseg.viewer._outgoing import id_map_bytes as id_map_bytes
 from splatseg.viewer._outgoing import selection_bytes as selection_bytes
 
-FEATURES = ("layer", "coco", "select_suggestion")
+FEATURES = ("layer", "coco", "select_suggestion", "preview")
 """What a server can besides the first form of the protocol."""
 
 MAX_TEXT = 4096
@@ -169,6 +170,9 @@ class DrawRequest(ViewCamera, kw_only=True, tag_field="type", tag="camera"):
     ids: bool = False
     """Whether an id map is to follow the picture at rest."""
 
+    preview: "Move | None" = None
+    """A move under way, which is drawn and changes nothing."""
+
 
 class SelectRequest(_Incoming, kw_only=True, tag_field="type", tag="select"):
     """What a person shows. Pixels are those of `camera`, or of the photograph `view`."""
@@ -184,7 +188,7 @@ class SelectRequest(_Incoming, kw_only=True, tag_field="type", tag="select"):
     """Of a stroke, pixels."""
 
     radius: Annotated[float, Meta(gt=0, le=1e9)] | None = None
-    """Of a sphere, scene units."""
+    """Of the balls of a sphere brush, scene units; `points` are where it went."""
 
     text: Annotated[str, Meta(max_length=200)] = ""
     level: Annotated[float, Meta(ge=0, le=1)] = 0.5

@@ -135,6 +135,9 @@ class State(_Outgoing, kw_only=True, tag_field="type", tag="state"):
     words: bool
     modes: list[str]
     features: list[str]
+    ramp: list[str]
+    """Colours of the ramp that values are drawn in, evenly spaced, ``#rrggbb``."""
+
     document: DocumentInfo
     undo: str | None
     redo: str | None
@@ -171,6 +174,16 @@ class Selected(_Outgoing, kw_only=True, tag_field="type", tag="selected"):
     confidence: float
     milliseconds: float
     stages: dict[str, float]
+
+
+class Legend(_Outgoing, kw_only=True, tag_field="type", tag="legend"):
+    """What the ends of the ramp stand for in the picture at rest of a mode; None without a ramp.
+
+    Depth in scene units, else shares of 1.
+    """
+
+    mode: str
+    ends: tuple[float, float] | None
 
 
 class PointAnswer(_Outgoing, kw_only=True, tag_field="type", tag="point"):
@@ -225,8 +238,8 @@ class Error(_Outgoing, kw_only=True, tag_field="type", tag="error"):
 
 
 Outgoing: TypeAlias = (
-    State | Patch | Selected | PointAnswer | HintAnswer | Clients | Ready | Progress | Finished
-    | Error
+    State | Patch | Selected | Legend | PointAnswer | HintAnswer | Clients | Ready | Progress
+    | Finished | Error
 )  # fmt: skip
 
 

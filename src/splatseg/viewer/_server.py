@@ -21,7 +21,8 @@ from splatseg.io.atomic import path_inside
 from splatseg.render import BackendName
 from splatseg.viewer import _guard as guard
 from splatseg.viewer import _messages as messages
-from splatseg.viewer._worker import Client, Worker, about
+from splatseg.viewer._client import Client
+from splatseg.viewer._worker import Worker, about
 
 STATIC = Path(__file__).parent / "static"
 """The page."""

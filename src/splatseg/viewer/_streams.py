@@ -18,10 +18,10 @@ from splatseg.errors import InputError
 from splatseg.io.scene_folder import GAUSSIANS_FILE, current_file
 from splatseg.io.splats import write_splats
 from splatseg.viewer import _messages as messages
+from splatseg.viewer._client import Client
 from splatseg.viewer._document import MEMBER, Document, Edit
-from splatseg.viewer._pictures import changes_rows
 from splatseg.viewer._session import Session
-from splatseg.viewer._worker import Client
+from splatseg.viewer._shown import changes_rows
 
 LEFT_OUT = 4095
 """The code of Gaussians that are not drawn. The page's palette has 4096 colours, by code: 0 is of
@@ -112,21 +112,19 @@ class Streams:
         return self._codes[1]
 
     def _codes_now(self) -> NDArray[np.uint16]:
-        session = self._session
-        owners = session.owners()
+        shown = self._session.shown
+        owners = shown.owners
         known = (owners >= 0) & (owners + 1 < LEFT_OUT)
         codes = np.where(known, owners + 1, 0).astype(np.uint16)
         # The page hides objects by their colour; what has none, it cannot.
-        codes[~session.visible & (owners >= 0) & ~known] = LEFT_OUT
-        for edit in session.document.edits:
-            if edit.kind == "remove":
-                codes[session.confidence(edit.mask) >= MEMBER] = LEFT_OUT
+        codes[~shown.visible & (owners >= 0) & ~known] = LEFT_OUT
+        codes[~shown.present] = LEFT_OUT
         return self._drawn(codes)
 
     def _drawn(self, values: NDArray[Number]) -> NDArray[Number]:
         """Values of the scene's Gaussians as those of the Gaussians that are drawn."""
         edits = self._session.document.edits
-        return values[self._session.edited_rows()] if changes_rows(edits) else values
+        return values[self._session.shown.rows] if changes_rows(edits) else values
 
 
 def _same(one: Document, other: Document) -> bool:

@@ -11,7 +11,7 @@ import pytest
 from splatseg.io.scene import load_scene
 from splatseg.io.splats import write_splats
 from splatseg.tasks import ImportOptions, import_scene
-from support.browser import BLUE, RED, Serving, Tab
+from support.browser import BLUE, GREEN, RED, Serving, Tab
 from support.browser_handles import TOUCHES
 
 pytestmark = pytest.mark.browser
@@ -378,7 +378,7 @@ def test_each_visible_control_is_reached_by_a_test(tab) -> None:
     tab.after(tab.row("mug").locator(".eye").click)
     look()
     tab.keep(BLUE, "bowl")
-    tab.click(RED)
+    tab.click(GREEN)  # the red ball is hidden
     tab.pick("bowl")
     look()
     menu("Split")
@@ -412,5 +412,4 @@ def test_each_visible_control_is_reached_by_a_test(tab) -> None:
     page.locator(".job").wait_for(state="detached")
     reached = {handle for handles in TOUCHES.values() for handle in handles}
     assert len(seen) > 90
-    # Words need a model of language: `test_no_words_here` looks at the field without one.
-    assert seen - reached == {"#find"}
+    assert seen <= reached

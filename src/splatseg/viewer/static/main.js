@@ -7,6 +7,7 @@ import { Look, replaceFragment } from "./look.js";
 import { ExportDialog } from "./panels/export.js";
 import { HelpDialog } from "./panels/help.js";
 import { JobsPanel } from "./panels/jobs.js";
+import { Legend } from "./panels/legend.js";
 import { ObjectsPanel } from "./panels/objects.js";
 import { SelectionBar } from "./panels/selection.js";
 import { StatusLine } from "./panels/status.js";
@@ -77,6 +78,7 @@ export class App {
     this.toolPanel = new ToolPanel(this);
     this.top = new TopBar(this);
     this.status = new StatusLine(this);
+    this.legend = new Legend(this);
     /** @type {Map<number, (point: Vec3|null) => void>} */
     this.depths = new Map();
     this.depthCount = 0;
@@ -163,6 +165,10 @@ export class App {
         store.hint = message.view != null ? /** @type {any} */ (message) : null;
         store.changed("hint");
         break;
+      case "legend":
+        store.legend = /** @type {any} */ (message);
+        store.changed("legend");
+        break;
       case "progress":
         this.jobs.progress(/** @type {any} */ (message));
         break;
@@ -232,6 +238,7 @@ export class App {
     if (id != null && this.jobs.failed({ id, text, fix })) return;
     if (command) this.waiting = Math.max(0, this.waiting - 1);
     if (command === "keep") this.keeping = false;
+    if (command === "move") this.tools.move.refused();
     if (gesture != null) {
       const depth = this.depths.get(gesture);
       this.depths.delete(gesture);
@@ -390,6 +397,8 @@ export class App {
     let count = this.store.document.objects.length + 1;
     while (names.has(`Object ${count}`)) count += 1;
     this.keeping = this.command("keep", { name: name || `Object ${count}` });
+    // The prompt is over: its points go, and the level is of the next one.
+    if (this.keeping) this.gestures.forget();
   }
 
   enter() {
@@ -437,13 +446,14 @@ export class App {
    * @param {"remove"|"duplicate"|"move"} kind
    * @param {import("./tools/move.js").Motion} [motion]
    * @param {number[]} [ids]
+   * @returns {boolean} Whether it went out.
    */
   edit(kind, motion, ids) {
     const { store, camera } = this;
     const objects = ids ?? (store.document.selection ? undefined : [...store.picked]);
     if (objects?.length === 0) {
       this.toast("Nothing is selected.", "Select a thing or pick an object in the list.");
-      return;
+      return false;
     }
     /** @type {Record<string, unknown>} */
     const args = objects ? { ids: objects } : {};
@@ -453,7 +463,7 @@ export class App {
       args.translation = mul(camera.right, (subject.radius || camera.radius * 0.05) * 1.5);
       args.about = subject.about;
     }
-    this.command(kind, args);
+    return this.command(kind, args);
   }
 
   /** @param {string} colour #rrggbb */

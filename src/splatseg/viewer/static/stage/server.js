@@ -45,6 +45,12 @@ export class ServerStage {
     this.restTimer = setTimeout(() => this.rest(), REST_AFTER);
   }
 
+  /** Nothing more of a move under way: it is made now, and the change is drawn by itself. */
+  hold() {
+    clearTimeout(this.restTimer);
+    this.wanted = false;
+  }
+
   /** A still, now. */
   rest() {
     clearTimeout(this.restTimer);
@@ -69,6 +75,7 @@ export class ServerStage {
     const { store, camera, stage } = this.app;
     // What moves is drawn in CSS pixels: four times as many on a fine screen would be for nobody.
     const scale = rest ? 1 : 1 / stage.ratio;
+    const preview = this.app.tools.move.preview();
     const id = this.id + 1;
     const sent = this.app.send({
       type: "camera",
@@ -77,7 +84,8 @@ export class ServerStage {
       mode: store.mode,
       only: store.only,
       rest,
-      ids: rest,
+      ids: rest && !preview,
+      ...(preview ? { preview } : {}),
     });
     if (!sent) return;
     this.id = id;
