@@ -54,10 +54,10 @@ def write_browser_scene(folder: Path) -> Path:
 class Serving:
     """`splatseg view` in a process of its own, once it has printed its link."""
 
-    def __init__(self, scene: Path, log: Path, *, port: int = 0) -> None:
+    def __init__(self, scene: Path, log: Path, *more: str, port: int = 0) -> None:
         self.scene = scene
         words = ("view", scene, "--no-open", "--json", "--backend", "cpu", "--port", port)
-        self.process = Forked(*words, log=log)
+        self.process = Forked(*words, *more, log=log)
         line = self.process.stdout.readline()
         if not line:
             raise RuntimeError(log.read_text())

@@ -209,6 +209,11 @@ TOUCHES: dict[str, tuple[str, ...]] = {
         "#suggestions Suggest from a layer…",
         "menu Suggest from a layer > things",
     ),
+    "test_the_person_chooses": (
+        "menu Settings > By the server",
+        "menu Settings > In the page, however slow",
+        "menu Settings > In the page, on its GPU",
+    ),
     "test_undo_and_redo_of_selections": (
         "#history Redo",
         "#history Undo",

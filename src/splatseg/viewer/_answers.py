@@ -37,6 +37,7 @@ from splatseg.viewer._prompts import prompts_of
 from splatseg.viewer._selecting import bytes_of
 from splatseg.viewer._session import Session, open_session
 from splatseg.viewer._shaping import combined
+from splatseg.viewer._streams import Streams
 from splatseg.viewer._worker import Client, Job, Worker
 
 T = TypeVar("T")
@@ -69,6 +70,7 @@ class SceneAnswers:
         name: What the page calls the scene.
         backend: Rendering backend, for jobs.
         fitting: How far its fit is, where it is not finished.
+        stage: Who draws while the camera moves, unless a page chooses otherwise.
     """
 
     def __init__(
@@ -81,11 +83,13 @@ class SceneAnswers:
         name: str,
         backend: BackendName = "auto",
         fitting: messages.FittingInfo | None = None,
+        stage: messages.Drawing = "server",
     ) -> None:
         self._session = session
         self._drawer = drawer
         self._worker = worker
         self._fitting = fitting
+        self._stage: messages.Drawing = stage
         self._ready = False
         self._features: dict[str, bool] = {}
         self._cleaning = float("inf")
@@ -96,6 +100,7 @@ class SceneAnswers:
         self._scene_info = scene_info(session.scene, name)
         self._views = view_infos(session.scene)
         self._pictures = Pictures(session, drawer)
+        self._streams = Streams(session)
         self._jobs = jobs.SceneJobs(
             session,
             pictures=self._pictures,
@@ -123,6 +128,7 @@ class SceneAnswers:
         self._jobs.close()
         self._session.close()
         self._pictures.close()
+        self._streams.close()
         self._drawer.close()
 
     def prepare(self) -> None:
@@ -134,6 +140,7 @@ class SceneAnswers:
     def join(self, client: Client) -> None:
         """Send a page all that it shows."""
         client.send(self.state(client))
+        self._streams.tell(client)
 
     def state(self, client: Client) -> messages.State:
         """All that a page shows."""
@@ -153,6 +160,7 @@ class SceneAnswers:
             me=client.id,
             ready=self._ready,
             fitting=self._fitting,
+            stage=self._stage,
         )
 
     def _modes(self) -> list[str]:
@@ -167,6 +175,10 @@ class SceneAnswers:
         """A photograph as JPEG."""
         return self._drawer.photograph(name, width)
 
+    def gaussians(self, version: int) -> Path:
+        """A PLY file of the Gaussians that are drawn, for a page that draws them itself."""
+        return self._streams.file(version)
+
     def _changed(self, old: Document, new: Document, author: str) -> None:
         """Tell all pages of a change, and draw it."""
         self._worker.broadcast(
@@ -178,6 +190,9 @@ class SceneAnswers:
                 author=author,
             )
         )
+        for client in self._worker.clients:
+            if client.welcomed:
+                self._streams.tell(client)
         self._worker.redraw(author)
 
     # Pictures.
@@ -227,6 +242,10 @@ class SceneAnswers:
                 self._select(client, message)
             case messages.CommandRequest():
                 self._command(client, message)
+            case messages.StageRequest():
+                client.stage = message.stage
+                client.data.pop("streams", None)
+                self._streams.tell(client)
             case messages.Undo():
                 _memory(client).gesture = None
                 self._session.undo(author=client.author)
@@ -480,7 +499,11 @@ def _milliseconds(began: float) -> float:
 
 
 def opener(
-    scene: Scene | Path, *, layer: str | None = None, backend: BackendName = "auto"
+    scene: Scene | Path,
+    *,
+    layer: str | None = None,
+    backend: BackendName = "auto",
+    stage: messages.Drawing = "server",
 ) -> Callable[[Worker], SceneAnswers]:
     """What opens a scene in the worker's thread.
 
@@ -488,6 +511,7 @@ def opener(
         scene: The scene, or its folder.
         layer: A layer whose objects are suggested at once.
         backend: Rendering backend.
+        stage: Who draws while the camera moves, unless a page chooses otherwise.
     """
 
     def opened(worker: Worker) -> SceneAnswers:
@@ -504,6 +528,7 @@ def opener(
                 relay=relay,
                 name="scene" if root is None else root.resolve().name,
                 backend=backend,
+                stage=stage,
             )
         except BaseException:
             session.close()

@@ -21,6 +21,7 @@ from splatseg.io.splats import WritableFormat
 from splatseg.viewer._outgoing import VERSION as VERSION
 from splatseg.viewer._outgoing import Clients as Clients
 from splatseg.viewer._outgoing import DocumentInfo as DocumentInfo
+from splatseg.viewer._outgoing import Drawing as Drawing
 from splatseg.viewer._outgoing import EditInfo as EditInfo
 from splatseg.viewer._outgoing import Error as Error
 from splatseg.viewer._outgoing import Finished as Finished
@@ -40,10 +41,12 @@ from splatseg.viewer._outgoing import Stage as Stage
 from splatseg.viewer._outgoing import State as State
 from splatseg.viewer._outgoing import SuggestionInfo as SuggestionInfo
 from splatseg.viewer._outgoing import ViewInfo as ViewInfo
+from splatseg.viewer._outgoing import codes_bytes as codes_bytes
 from splatseg.viewer._outgoing import error_message as error_message
 from splatseg.viewer._outgoing import form as form
 from splatseg.viewer._outgoing import frame_bytes as frame_bytes
 from splatseg.viewer._outgoing import id_map_bytes as id_map_bytes
+from splatseg.viewer._outgoing import selection_bytes as selection_bytes
 
 FEATURES = ("layer", "coco", "select_suggestion")
 """What a server can besides the first form of the protocol."""
@@ -142,6 +145,14 @@ class Hello(_Incoming, kw_only=True, tag_field="type", tag="hello"):
 
     version: int
     token: Annotated[str, Meta(max_length=200)] | None = None
+    stage: Drawing = "server"
+    """A page that draws is told what each Gaussian belongs to."""
+
+
+class StageRequest(_Incoming, kw_only=True, tag_field="type", tag="stage"):
+    """Another one draws from now on."""
+
+    stage: Drawing
 
 
 class DrawRequest(ViewCamera, kw_only=True, tag_field="type", tag="camera"):
@@ -225,8 +236,8 @@ class Cancel(_Incoming, kw_only=True, tag_field="type", tag="cancel"):
 
 
 Incoming: TypeAlias = (
-    Hello | DrawRequest | SelectRequest | CommandRequest | Undo | Redo | DepthRequest
-    | HintRequest | JobRequest | Cancel
+    Hello | StageRequest | DrawRequest | SelectRequest | CommandRequest | Undo | Redo
+    | DepthRequest | HintRequest | JobRequest | Cancel
 )  # fmt: skip
 
 

@@ -163,6 +163,8 @@ def scene_info(scene: Scene, name: str) -> messages.SceneInfo:
         centre=centre,
         radius=radius,
         home=_home(scene, centre, radius, up),
+        low_pass=scene.gaussians.low_pass,
+        antialiased=scene.gaussians.antialiased,
     )
 
 

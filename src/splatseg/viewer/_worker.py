@@ -38,9 +38,14 @@ class Cancelled(Exception):
 class Client:
     """A page: where answers go, and what it asked for last."""
 
-    def __init__(self, id: int, post: Callable[[str | bytes], None]) -> None:
+    def __init__(
+        self, id: int, post: Callable[[str | bytes], None], stage: messages.Drawing = "server"
+    ) -> None:
         self.id = id
         self._post = post
+        self.stage: messages.Drawing = stage
+        """Who draws what it shows while the camera moves."""
+
         self.waiting_camera: messages.DrawRequest | None = None
         """The newest camera that was not drawn yet."""
 
@@ -148,6 +153,10 @@ class Answers(Protocol):
         """A photograph as JPEG."""
         ...
 
+    def gaussians(self, version: int) -> Path:
+        """A PLY file of the Gaussians that are drawn."""
+        ...
+
     def close(self) -> None:
         """Save and release."""
         ...
@@ -210,16 +219,19 @@ class Worker:
         if self._thread.ident is not None:
             self._thread.join()
 
-    def join(self, post: Callable[[str | bytes], None]) -> Client | None:
+    def join(
+        self, post: Callable[[str | bytes], None], stage: messages.Drawing = "server"
+    ) -> Client | None:
         """A page that comes; None where there are too many.
 
         Args:
             post: Sends it a message, from any thread.
+            stage: Who draws what it shows while the camera moves.
         """
         with self._changed:
             if len(self._clients) >= guard.MAX_CLIENTS or self.closing:
                 return None
-            client = Client(self._next_id, post)
+            client = Client(self._next_id, post, stage)
             self._next_id += 1
             self._clients[client.id] = client
             count = len(self._clients)

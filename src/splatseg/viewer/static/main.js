@@ -16,6 +16,7 @@ import { ToolPanel } from "./panels/tools.js";
 import { TopBar } from "./panels/top.js";
 import { ViewsPanel } from "./panels/views.js";
 import { Socket, readFragment } from "./socket.js";
+import { GpuStage } from "./stage/gpu.js";
 import { ServerStage } from "./stage/server.js";
 import { Stage } from "./stage/stage.js";
 import { Store } from "./state.js";
@@ -45,10 +46,12 @@ export class App {
     this.camera = new Camera();
     this.socket = new Socket({
       message: (message) => this.receive(message),
-      frame: (data) => this.server.receive(data),
+      frame: (data) => this.drawing.receive(data),
       status: (status) => this.connection(status),
     });
     this.server = new ServerStage(this);
+    /** Whoever draws while the camera moves: the page, or the server. */
+    this.drawing = new GpuStage(this, this.server);
     this.gestures = new Gestures(this);
     this.tools = {
       click: new ClickTool(this),
@@ -183,11 +186,12 @@ export class App {
       this.camera.up = unit(scene.up ?? [0, 0, 1]);
       if (!this.link || !this.camera.fromLink(this.link)) this.look.goHome();
       this.stage.resize();
+      this.drawing.choose(message.stage);
     }
     if (!scene.modes.includes(this.store.mode)) this.store.mode = scene.modes[0] ?? "colour";
     this.store.changed("mode");
     this.waiting = 0;
-    this.server.reset();
+    this.drawing.reset();
   }
 
   /** @param {import("./state.js").PatchMessage} message */
@@ -327,7 +331,7 @@ export class App {
     if (store.mode !== "colour") store.previousMode = store.mode;
     store.mode = mode;
     store.changed("mode");
-    this.server.rest();
+    this.drawing.rest();
   }
 
   toggleOverlay() {
@@ -343,7 +347,7 @@ export class App {
   setOnly(id) {
     this.store.only = id;
     this.store.changed("mode");
-    this.server.rest();
+    this.drawing.rest();
   }
 
   /** Brush or radius. @param {number} factor */

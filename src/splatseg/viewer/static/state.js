@@ -15,13 +15,15 @@
  * @typedef {{name: string, matrix: number[], width: number, height: number, fx: number, fy: number,
  *   cx: number, cy: number, split: string, photograph: boolean}} SceneView
  * @typedef {{name: string, count: number, up: Vec3|null, centre: Vec3, radius: number,
- *   home: {matrix: number[], focal: number, width: number, height: number}}} SceneFacts
+ *   home: {matrix: number[], focal: number, width: number, height: number}, low_pass: number,
+ *   antialiased: boolean}} SceneFacts
  * @typedef {SceneFacts & {views: SceneView[], layers: string[], source: string|null,
  *   words: boolean, modes: string[]}} SceneInfo
  * @typedef {{type: "state", version: number, scene: SceneFacts, views: SceneView[],
  *   layers: string[], source: string|null, words: boolean, modes: string[], document: Document,
  *   undo: string|null, redo: string|null, clients: number, me: string|number, ready?: boolean,
- *   fitting?: {steps: number, progress: number}|null, features?: string[]}} StateMessage
+ *   fitting?: {steps: number, progress: number}|null, features?: string[],
+ *   stage: "server"|"gpu"}} StateMessage
  * @typedef {{type: "patch", from: number, to: number, objects?: SceneObject[]|null,
  *   gone?: number[]|null, order?: number[]|null, suggestions?: Suggestion[]|null,
  *   selection?: SelectionInfo|null, edits?: EditInfo[]|null, isolated?: number[]|null,

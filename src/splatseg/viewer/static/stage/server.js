@@ -2,6 +2,8 @@
  * Pictures drawn by the server: newest camera wins, one frame in flight, a still at rest.
  */
 
+import { unpacked } from "./binary.js";
+
 /** @typedef {import("../main.js").App} App */
 
 const REST_AFTER = 180;
@@ -27,18 +29,26 @@ export class ServerStage {
     this.measures = 0;
     /** @type {Uint8Array|null} */
     this.lastFrame = null;
+    /** Called when the picture at rest of where the camera is has been painted. */
+    this.still = () => {};
   }
 
   /** The camera moved. */
   moved() {
     this.ask(false);
+    this.restLater();
+  }
+
+  /** A still, once the camera has not moved for a while. */
+  restLater() {
     clearTimeout(this.restTimer);
-    this.restTimer = setTimeout(() => this.ask(true), REST_AFTER);
+    this.restTimer = setTimeout(() => this.rest(), REST_AFTER);
   }
 
   /** A still, now. */
   rest() {
     clearTimeout(this.restTimer);
+    this.restTimer = 0;
     this.ask(true);
   }
 
@@ -116,6 +126,8 @@ export class ServerStage {
     }
     this.painted = order;
     this.app.stage.paint(bitmap);
+    const rest = view.getUint8(17) === 1;
+    if (rest && id === this.id && !this.restTimer) this.still();
     const now = performance.now();
     const { store } = this.app;
     store.frame = {
@@ -127,7 +139,7 @@ export class ServerStage {
       whole: start === undefined ? (store.frame?.whole ?? 0) : now - start,
     };
     bitmap.close();
-    if (start !== undefined) this.measure(start, now, view.getUint8(17) === 1);
+    if (start !== undefined) this.measure(start, now, rest);
     store.changed("status");
   }
 
@@ -146,11 +158,9 @@ export class ServerStage {
     const id = view.getUint32(1, true);
     const width = view.getUint16(5, true);
     const height = view.getUint16(7, true);
-    const packed = new Blob([new Uint8Array(data, 9)]).stream();
-    const plain = packed.pipeThrough(new DecompressionStream("deflate"));
     let ids;
     try {
-      ids = new Uint16Array(await new Response(plain).arrayBuffer());
+      ids = new Uint16Array(await unpacked(data, 9));
     } catch {
       return;
     }

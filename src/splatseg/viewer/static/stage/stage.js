@@ -151,7 +151,7 @@ export class Stage {
     this.outlines.clear();
     this.setHover(0);
     this.photograph.check();
-    this.app.server.moved();
+    this.app.drawing.moved();
     this.app.look.remember();
     this.redraw();
   }
