@@ -26,7 +26,7 @@ from splatseg.models.networks._config import (
     offline,
 )
 from splatseg.models.networks._library import side_of
-from support.networks import IMAGE, KINDS, asked, copied, in_parts
+from support.networks import IMAGE, KINDS, asked, checkpoint, copied, in_parts
 
 
 @pytest.fixture
