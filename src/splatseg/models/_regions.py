@@ -106,7 +106,8 @@ def nested_masks(
     with one_thread():
         array = np.ascontiguousarray(image.cpu().numpy())
         if array.shape[:2] != (height, width):
-            array = np.asarray(cv2.resize(array, (width, height), interpolation=cv2.INTER_AREA))
+            array = cv2.resize(array, (width, height), interpolation=cv2.INTER_AREA)
+        array = np.asarray(array, np.uint8)
         features = pixel_features(array, strength=np.ascontiguousarray(contours[..., 0]))
     return _merged(image, features, options or ClassicalOptions())
 

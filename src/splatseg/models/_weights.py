@@ -385,7 +385,7 @@ def _check_entries(folder: Path) -> None:
     if adapter.exists():
         raise FileFormatError(f"{adapter}: expected the weights of a network, got an adapter.")
     for path in sorted(folder.iterdir()):
-        expected = any(path.match(pattern) for pattern in (*_WEIGHTS, *_FILES))
+        expected = any(path.match(pattern) for pattern in (*_WEIGHTS, _KERAS, *_FILES))
         if not path.is_file() and (expected or (path.exists() and not path.is_dir())):
             raise FileFormatError(f"{path}: expected a regular file, got something else.")
 

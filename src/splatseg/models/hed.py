@@ -119,9 +119,9 @@ class Hed(BatchedNetwork[NDArray[np.float32]]):
             raise FileFormatError(f"{place.folder}: expected a file of weights, got a folder.")
         if place.size is not None and place.size > _MAX_SIZE:
             raise RangeError(f"size: expected at most {_MAX_SIZE} for {name}, got {place.size}.")
-        self._network = read_network(place.file).to(
-            place.device, place.dtype, memory_format=torch.channels_last
-        )
+        network = read_network(place.file).to(place.device, place.dtype)
+        # Twice as quick on a CPU: oneDNN's layout for this one asks for no copies.
+        self._network: HedNetwork = network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
         self._input_size = place.size or WORKING_SIZE
         self._regions = options
 
@@ -153,7 +153,7 @@ class Hed(BatchedNetwork[NDArray[np.float32]]):
                 rows, columns = (max(1, round(side * scale)) for side in (height, width))
                 how = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
                 scaled = [cv2.resize(one, (columns, rows), interpolation=how) for one in small]
-                maps = self._maps(np.stack([np.asarray(one) for one in scaled]))
+                maps = self._maps(np.array(scaled, np.uint8))
                 for i, one in enumerate(maps):
                     fused = cv2.resize(one[..., -1], (width, height))
                     found[i, ..., k] = fused
@@ -242,8 +242,8 @@ def _widths(path: Path, tensors: Mapping[str, Any]) -> list[int]:
     }
     for k, depth in enumerate(_DEPTHS, 1):
         shape = tensors[f"block{k}/layers/conv2d/vars/1"].shape
-        width = int(shape[0]) if shape else 0
-        expect(width > 0, path, f"one axis of block{k}/layers/conv2d/vars/1", shape)
+        width = int(shape[0]) if shape is not None and len(shape) == 1 else 0
+        expect(width > 0, path, f"block{k}/layers/conv2d/vars/1 of one axis, not empty", shape)
         widths.append(width)
         wanted |= {f"dsn{k}/vars/0": (1, 1, width, 1), f"dsn{k}/vars/1": (1,)}
         for i in range(depth):
