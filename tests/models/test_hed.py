@@ -242,7 +242,9 @@ def test_tensors_that_are_missing_or_of_another_kind(tmp_path, name: str) -> Non
 @pytest.mark.parametrize("shape", [(), (0,), (2, 2)])
 def test_a_block_without_channels(tmp_path, shape) -> None:
     content = tensors() | {"block2/layers/conv2d/vars/1": np.zeros(shape, np.float32)}
-    with pytest.raises(FileFormatError, match=r"expected block2/layers/conv2d/vars/1 (of one axis|in one)"):
+    with pytest.raises(
+        FileFormatError, match=r"expected block2/layers/conv2d/vars/1 (of one axis|in one)"
+    ):
         read_network(write(tmp_path / "a.h5", content))
 
 

