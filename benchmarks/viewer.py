@@ -1,6 +1,7 @@
 """What a person waits for in the viewer: frames, clicks, hovering, in a real Chromium.
 
     python benchmarks/viewer.py SCENE [--million] [--repeats 3] [--json FILE]
+    python benchmarks/viewer.py SCENE --stage gpu [--software] [--pictures DIR]
 
 The scene needs a layer that answers clicks (`splatseg segment SCENE --method associate`). It is
 served by `splatseg view` from a copy whose journal is empty, and shown on a canvas of 720 x 600.
@@ -16,6 +17,8 @@ served by `splatseg view` from a copy whose journal is empty, and shown on a can
 - `idle`: CPU seconds of the server and of the page in 10 s in which nobody does anything.
 
 `--million` tiles the scene to a million Gaussians, and its layer with it, and measures `orbit`.
+`--stage gpu` measures the stage that draws in the page instead (`viewer_gpu.py`); `--software` lets
+Chromium's SwiftShader draw, where there is no GPU.
 """
 
 import argparse
@@ -32,6 +35,7 @@ from typing import Any
 
 import numpy as np
 import torch
+import viewer_gpu
 from viewer_browser import (
     WIDTH,
     Server,
@@ -235,6 +239,9 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=1)
     parser.add_argument("--seconds", type=float, default=8)
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--stage", choices=("server", "gpu"), default="server")
+    parser.add_argument("--software", action="store_true")
+    parser.add_argument("--pictures", type=Path)
     args = parser.parse_args()
     torch.set_grad_enabled(False)
     found: list[dict[str, Any]] = []
@@ -245,9 +252,20 @@ def main() -> None:
         else:
             shutil.copytree(args.scene, scene, ignore=shutil.ignore_patterns("view", "exports"))
         for _ in range(args.repeats):
-            made = measure(scene, whole=not args.million, seconds=args.seconds)
+            if args.stage == "gpu":
+                large = Path(folder) / "large"
+                made = viewer_gpu.measure(
+                    scene,
+                    large if large.is_dir() else tiled(scene, large, viewer_gpu.BITS),
+                    software=args.software,
+                    orbit=lambda viewer: orbit(viewer, args.seconds),
+                    pictures=args.pictures,
+                )
+            else:
+                made = measure(scene, whole=not args.million, seconds=args.seconds)
             found.append(made)
-            print("\n".join(report(made)), flush=True)
+            lines = viewer_gpu.report(made) if args.stage == "gpu" else report(made)
+            print("\n".join(lines), flush=True)
             shutil.rmtree(scene / "view", ignore_errors=True)
     if args.json is not None:
         args.json.write_text(json.dumps(found))

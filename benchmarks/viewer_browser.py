@@ -116,10 +116,12 @@ def _url(process: "subprocess.Popen[str]") -> str:
 
 
 @contextmanager
-def chromium() -> Generator[Browser]:
+def chromium(*arguments: str) -> Generator[Browser]:
     """Debian's Chromium, until the end of the block."""
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        browser = playwright.chromium.launch(
+            executable_path=CHROMIUM, args=["--no-sandbox", *arguments]
+        )
         try:
             yield browser
         finally:
@@ -127,9 +129,24 @@ def chromium() -> Generator[Browser]:
 
 
 class Viewer:
-    """A page of the viewer whose picture is 720 x 600."""
+    """A page of the viewer whose picture is 720 x 600, or of another size.
 
-    def __init__(self, browser: Browser, url: str) -> None:
+    Args:
+        browser: The browser.
+        url: The link of the server.
+        script: Runs in the page before its own.
+        size: Width and height of the picture.
+    """
+
+    def __init__(
+        self,
+        browser: Browser,
+        url: str,
+        script: str = "",
+        *,
+        size: tuple[int, int] = (WIDTH, HEIGHT),
+    ) -> None:
+        self._size = size
         self.context = browser.new_context(
             viewport={"width": 1300, "height": 760}, reduced_motion="reduce"
         )
@@ -137,6 +154,7 @@ class Viewer:
         self.errors: list[str] = []
         self.page.on("pageerror", lambda error: self.errors.append(str(error)))
         self.page.add_init_script(_WATCH)
+        self.page.add_init_script(script)
         self.page.goto(url)
         self._cdp: Any = None
         self.await_type("F")
@@ -147,7 +165,10 @@ class Viewer:
             self.settle()
             box, size = self.box(), self.page.viewport_size
             assert size is not None
-            wider, higher = round(WIDTH - box["width"]), round(HEIGHT - box["height"])
+            wider, higher = (
+                round(wanted - box[side])
+                for wanted, side in zip(self._size, ("width", "height"), strict=True)
+            )
             if not (wider or higher):
                 return
             self.page.set_viewport_size(

@@ -48,7 +48,7 @@ struct TileColumns {
       }
       const int64_t channels = (static_cast<int64_t>(mine.size()) + 15) / 16 * 16;
       float* to = values[b].resize(16 * channels);
-      std::memset(to, 0, sizeof(float) * static_cast<size_t>(16 * channels));
+      std::fill_n(to, 16 * channels, 0.0F);  // where there are none, `to` is null
       for (int l = 0; l < 16; ++l) {
         const int64_t pixel = pixel_of(b, l);
         if (pixel < 0) continue;

@@ -230,3 +230,24 @@ def test_the_json_file_is_looked_at_before_the_scores(small, splatseg) -> None:
     )
     assert status == 2
     assert "a.json: expected a place in a folder that is there" in err
+
+
+def test_ctrl_c_that_breaks_an_import_off_is_no_error(splatseg, monkeypatch) -> None:
+    from splatseg import cli
+
+    def fails(entry: object, name: str, words: list[str]) -> int:
+        try:
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(5)
+        except KeyboardInterrupt:
+            raise ImportError("cannot load module more than once per process") from None
+        return 0
+
+    monkeypatch.setattr(cli, "_run", fails)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        assert splatseg("info", "x")[::2] == (1, "interrupted\n")
+    finally:
+        signal.signal(signal.SIGINT, before)
+    monkeypatch.setattr(cli, "_run", lambda *_: 1 // 0)
+    assert "ZeroDivisionError" in splatseg("info", "x")[2]

@@ -245,3 +245,15 @@ def test_an_empty_scene_can_be_joined(some) -> None:
     same(edited.gaussians, some)
     assert edited.rows.tolist() == [-1] * 24
     assert np.isfinite(edited.gaussians.means.numpy()).all()
+
+
+def test_old_rows_of_a_mask_are_those_with_a_new_row_in_it(some) -> None:
+    edited = Edited(gaussians=some[:5], rows=torch.tensor([2, 0, 2, -1, 3]))
+    mask = torch.tensor([True, False, False, True, True])
+    assert edited.rows_before(mask, 4).tolist() == [False, False, True, True]
+    assert edited.rows_before(~mask, 4).tolist() == [True, False, True, False]
+    with pytest.raises(ShapeError, match="mask"):
+        edited.rows_before(mask[:4], 4)
+    with pytest.raises(ShapeError, match="an edit of 3 rows"):
+        edited.rows_before(mask, 3)
+    assert not edited.rows_before(torch.zeros(5, dtype=torch.bool), 4).any()

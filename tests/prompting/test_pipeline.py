@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from splatseg.core import Edited
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.neighbours import NeighbourIndex, Subset
 from splatseg.prompting import pipeline
@@ -193,6 +194,26 @@ def test_a_mask_confirms_and_rules_out(gaussians, view) -> None:
     assert kept[(column > 4) & (column < 16) & (row > 12) & (row < 18)].all()
     seen = (column > 20) & (column < 34) & (row > 12) & (row < 28)
     assert not kept[seen].any(), "the view shows them beside the mask"
+
+
+def test_a_mask_confirms_what_the_view_shows_after_an_edit(gaussians, view) -> None:
+    """The wall stands half a unit to the right: what was left of the mask's middle is in it."""
+    moved = gaussians.replace(means=gaussians.means + torch.tensor([0.5, 0.0, 0.0]))
+    rows = torch.arange(0, len(moved), 2).flip(0)  # the others were removed
+    edited = Edited(gaussians=moved[rows], rows=rows)
+    mask = torch.zeros(30, 40, dtype=torch.bool)
+    mask[11:19, 2:18] = True
+    views = ViewCache(gaussians, backend="cpu", edited=lambda _: edited)
+    (prompt,) = see_prompts(gaussians, [ViewPrompt(view=view, mask=mask)], views=views)
+    context = replace(shown(gaussians, view, "features", mask=mask), views=views, prompts=(prompt,))
+    confirmed, ruled_out = pipeline._by_masks(context)
+    column = 25 + 10 * gaussians.means[:, 0]
+    row = 10 + 10 * gaussians.means[:, 1]
+    left = torch.zeros(len(gaussians), dtype=torch.bool)
+    left[rows] = True
+    assert confirmed[left & (column > 4) & (column < 16) & (row > 12) & (row < 18)].all()
+    assert ruled_out[left & (column > 20) & (column < 34) & (row > 12) & (row < 28)].all()
+    assert not (confirmed | ruled_out)[~left].any()
 
 
 def test_features_alone_grow_among_what_is_nearly_similar(gaussians, view, field) -> None:

@@ -9,7 +9,15 @@ from hypothesis import strategies as st
 
 from splatseg.core import Selection, View
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.prompting.prompts import AxisBox, Ball, Lasso, Similar, ViewPrompt, pixels_in_box
+from splatseg.prompting.prompts import (
+    AxisBox,
+    Ball,
+    Balls,
+    Lasso,
+    Similar,
+    ViewPrompt,
+    pixels_in_box,
+)
 from support.wall import camera, wall
 
 NOTHING = torch.zeros(30, 40, dtype=torch.bool)
@@ -55,6 +63,10 @@ def test_solids_hold_centres(gaussians) -> None:
     assert torch.equal(box.contains(gaussians), (x.abs() < 0.5) & (y > 0.2) & (y < 0.6))
     ball = Ball(centre=(0.0, 1.0, 2.0), radius=0.33)
     assert torch.equal(ball.contains(gaussians), x**2 + (y - 1) ** 2 <= 0.33**2)
+    centres = torch.tensor([[0.0, 1.0, 2.0], [1.0, 0.4, 2.0], [0.0, 1.0, 9.0]])
+    balls = Balls(centres=centres, radius=0.33)
+    second = (x - 1) ** 2 + (y - 0.4) ** 2 <= 0.33**2
+    assert torch.equal(balls.contains(gaussians), ball.contains(gaussians) | second)
 
 
 def test_a_lasso_holds_what_lies_behind_it_and_nothing_behind_the_camera(gaussians, view) -> None:
@@ -90,6 +102,12 @@ def test_solids_that_cannot_be(view) -> None:
         AxisBox(low=(0, 0, 0), high=(1, 0, 1))
     with pytest.raises(RangeError, match="sphere"):
         Ball(centre=(0, 0, 0), radius=0)
+    with pytest.raises(RangeError, match="sphere"):
+        Balls(centres=torch.zeros(1, 3), radius=-1)
+    with pytest.raises(RangeError, match="centres"):
+        Balls(centres=torch.tensor([[0.0, torch.nan, 0.0]]), radius=1)
+    with pytest.raises(ShapeError, match="at least one ball"):
+        Balls(centres=torch.zeros(0, 3), radius=1)
     with pytest.raises(ShapeError, match="at least 3 corners, got 2"):
         Lasso(view=view, polygon=torch.zeros(2, 2))
     with pytest.raises(InputError, match="similar: expected a selection of something"):

@@ -5,11 +5,13 @@ from dataclasses import replace
 import pytest
 import torch
 
+from splatseg.core import Edited, Gaussians, Labels, View
 from splatseg.errors import InputError, RangeError
+from splatseg.lift.label_maps import label_map, view_label_map
 from splatseg.prompting import seen as seen_module
-from splatseg.prompting.prompts import ViewPrompt
+from splatseg.prompting.prompts import AxisBox, Lasso, ViewPrompt
 from splatseg.prompting.seen import ViewCache, see_prompts, thinned
-from splatseg.render import weights
+from splatseg.render import prepare, weights
 
 
 def region(rows: slice, columns: slice) -> torch.Tensor:
@@ -155,3 +157,64 @@ def test_views_are_kept_and_used_again(gaussians, view, side) -> None:
     assert len(views) == 0
     with pytest.raises(RangeError, match="capacity"):
         ViewCache(gaussians, capacity=0)
+
+
+def test_a_view_of_what_an_edit_made_speaks_of_the_rows_before_it(gaussians, view, side) -> None:
+    """A copy one ball's width nearer, without the right half; the side view shows no edit."""
+    count = len(gaussians)
+    left = torch.nonzero(gaussians.means[:, 0] < 0).squeeze(1)
+    lift = torch.tensor([0.0, 0.1, -0.3])
+    parts = [gaussians[left], gaussians[left].replace(means=gaussians.means[left] + lift)]
+    edited = Edited(gaussians=Gaussians.concatenate(parts), rows=torch.cat((left, left)))
+    labels = Labels(ids=torch.arange(count).int() % 7, confidence=torch.ones(count))
+    pixels = torch.tensor([[10, 20], [12, 24], [30, 20]])
+    asked: list[View | None] = []
+
+    def shown(one: View | None) -> Edited | None:
+        asked.append(one)
+        return None if one is side else edited
+
+    with ViewCache(gaussians, backend="cpu", edited=shown) as views:
+        with prepare(edited.gaussians, view.camera, backend="cpu") as drawn:
+            there = views.weights(view, pixels)
+            wanted = torch.zeros(3, count).index_add_(
+                1, edited.rows, torch.from_numpy(drawn.weights(pixels).to_scipy().toarray())
+            )
+            assert torch.allclose(torch.from_numpy(there.to_scipy().toarray()), wanted, atol=1e-6)
+            assert float(wanted[2].sum()) == 0, "the right half is gone"
+            assert float(wanted[0].sum()) > 0.9
+            drawn_labels = view_label_map(drawn, labels[edited.rows])
+            assert torch.equal(views.label_map(view, labels).ids, drawn_labels.ids)
+        assert views.shown(view) is edited
+        assert torch.equal(views.shown(side).rows, torch.arange(count))
+        plain = weights(gaussians, side.camera, pixels, backend="cpu")
+        assert torch.equal(views.weights(side, pixels).ids, plain.ids)
+        assert torch.equal(
+            views.label_map(side, labels).ids, label_map(gaussians, side.camera, labels).ids
+        )
+        nearer = AxisBox(low=(-9, -9, 1.6), high=(9, 9, 1.8))
+        assert torch.equal(views.inside(nearer).nonzero().squeeze(1), left)
+        assert asked[-1] is None, "a box is in the world"
+        corners = torch.tensor([[0.0, 0], [40, 0], [40, 30], [0, 30]])
+        assert int(views.inside(Lasso(view=side, polygon=corners)).sum()) > len(left)
+        dark = edited.gaussians.replace(opacities=torch.zeros(2 * len(left)))
+        edited = Edited(gaussians=dark, rows=edited.rows)
+        assert not views.inside(nearer).any(), "what is not shown is nowhere"
+
+
+def test_views_of_another_edit_are_prepared_anew_and_those_before_let_go(
+    gaussians, view, side
+) -> None:
+    edits = [Edited.unchanged(gaussians), Edited.unchanged(gaussians)]
+
+    def shown(one: View | None) -> Edited | None:
+        return None if one is side else edits[-1]
+
+    with ViewCache(gaussians, backend="cpu", edited=shown) as views:
+        plain, first = views.prepared(side), views.prepared(view)
+        assert views.prepared(view) is first
+        assert len(views) == 2
+        edits.pop()
+        assert views.prepared(view) is not first
+        assert len(views) == 2
+        assert views.prepared(side) is plain

@@ -18,10 +18,17 @@ import numpy as np
 import torch
 from playwright.sync_api import Browser, BrowserContext, Locator
 
+from splatseg.core import FeatureMap, Features, Labels, LayerInfo
+from splatseg.io.evidence import (
+    TextEmbeddings,
+    create_evidence,
+    save_features,
+    save_text_embeddings,
+)
 from splatseg.io.scene import load_scene, save_scene, save_scene_layer
 from support.browser_handles import TOUCHES
 from support.forked import Forked
-from support.viewer import MATRIX, Page, write_scene
+from support.viewer import EACH, HEIGHT, MATRIX, WIDTH, Page, write_scene
 
 RED, BLUE, GREEN = (-1.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 3.0, 1.5)
 """Middles of the balls of `support.viewer.write_scene`."""
@@ -51,13 +58,41 @@ def write_browser_scene(folder: Path) -> Path:
     return folder
 
 
+def write_worded_scene(folder: Path) -> Path:
+    """The balls, red and blue of one class and the blue one unsure, and features of two words."""
+    write_browser_scene(folder)
+    scene = load_scene(folder)
+    evidence = create_evidence(folder / "evidence" / "features_words", kind="features")
+    grid = FeatureMap(features=torch.rand(2, 5, 6), stride=16, height=HEIGHT, width=WIDTH)
+    save_features(grid, evidence, "first")
+    words = TextEmbeddings(
+        labels=("mug", "plant"), vectors=torch.eye(2), kinds=("class", "class"), target_ids=(1, 2)
+    )
+    save_text_embeddings(words, evidence)
+    count = len(scene.gaussians)
+    which = torch.arange(count) // EACH // 2
+    features = Features(
+        values=torch.eye(2)[which],
+        weights=torch.ones(count),
+        info=LayerInfo(method="objects", evidence="features_words"),
+    )
+    save_scene_layer(features, folder, "objects")
+    layer = scene.layers["things"]
+    if not isinstance(layer, Labels):
+        raise TypeError("things are labels")
+    info = replace(layer.info, class_of={1: 1, 2: 1, 3: 2})
+    sure = torch.where(layer.ids == 2, 0.55, 1.0)
+    save_scene_layer(replace(layer, confidence=sure, info=info), folder, "things")
+    return folder
+
+
 class Serving:
     """`splatseg view` in a process of its own, once it has printed its link."""
 
-    def __init__(self, scene: Path, log: Path, *, port: int = 0) -> None:
+    def __init__(self, scene: Path, log: Path, *more: str, port: int = 0) -> None:
         self.scene = scene
         words = ("view", scene, "--no-open", "--json", "--backend", "cpu", "--port", port)
-        self.process = Forked(*words, log=log)
+        self.process = Forked(*words, *more, log=log)
         line = self.process.stdout.readline()
         if not line:
             raise RuntimeError(log.read_text())
@@ -302,6 +337,25 @@ class Tab:
     def row(self, name: str) -> Locator:
         """The row of an object."""
         return self.page.locator("#objects .row", has_text=name)
+
+    def colour(self, point: Sequence[float]) -> tuple[int, int, int]:
+        """What the picture has at a world point, red, green and blue."""
+        x, y = self.at(point)
+        box = self.page.locator("#picture").bounding_box()
+        if box is None:
+            raise AssertionError("no picture")
+        red, green, blue = self.page.evaluate(
+            """([x, y]) => {
+                const one = new OffscreenCanvas(1, 1);
+                const g = one.getContext('2d', { willReadFrequently: true });
+                const picture = document.querySelector('#picture');
+                g.drawImage(
+                    picture, -Math.round(x * picture.width), -Math.round(y * picture.height));
+                return [...g.getImageData(0, 0, 1, 1).data.slice(0, 3)];
+            }""",
+            [(x - box["x"]) / box["width"], (y - box["y"]) / box["height"]],
+        )
+        return red, green, blue
 
     def pick(self, *names: str) -> None:
         """Pick objects in the list."""

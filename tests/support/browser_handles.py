@@ -148,6 +148,7 @@ TOUCHES: dict[str, tuple[str, ...]] = {
         "#points-more",
         "#points-new",
     ),
+    "test_next_click": ("#bar Next click",),
     "test_nothing_comes_from_elsewhere": (
         "#views .thumb",
         "#views Compare with the photograph",
@@ -209,6 +210,12 @@ TOUCHES: dict[str, tuple[str, ...]] = {
         "#suggestions Suggest from a layer…",
         "menu Suggest from a layer > things",
     ),
+    "test_the_person_chooses": (
+        "menu Settings > By the server",
+        "menu Settings > In the page, however slow",
+        "menu Settings > In the page, on its GPU",
+    ),
+    "test_words": ("#find",),
     "test_undo_and_redo_of_selections": (
         "#history Redo",
         "#history Undo",

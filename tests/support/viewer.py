@@ -207,8 +207,8 @@ def logged_in(server: Any) -> Iterator[httpx.Client]:
         yield client
 
 
-def opened(server: Any, *, hello: bool = True) -> Page:
-    """A page that has said hello and has the state, as `page.heard[0]`."""
+def opened(server: Any, *, hello: bool = True, **fields: Any) -> Page:
+    """A page that has said hello, with `fields`, and has the state, as `page.heard[0]`."""
     base = base_url(server)
     page = Page(
         uri=f"{base.replace('http', 'ws')}/socket",
@@ -217,6 +217,6 @@ def opened(server: Any, *, hello: bool = True) -> Page:
         max_size=None,
     )
     if hello:
-        page.send("hello", version=1)
+        page.send("hello", version=1, **fields)
         page.next("state")
     return page

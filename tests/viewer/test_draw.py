@@ -18,7 +18,15 @@ from splatseg.render import prepare, render
 from splatseg.viewer import _draw
 from splatseg.viewer._draw import MODES, Drawer, Pace, scaled
 from splatseg.viewer._pace import SIZES
-from splatseg.viewer._tint import RAMP, component_tint, over, owners_of, selected_tint, stretched
+from splatseg.viewer._tint import (
+    RAMP,
+    RAMP_STOPS,
+    component_tint,
+    over,
+    owners_of,
+    selected_tint,
+    stretched,
+)
 
 WIDTH, HEIGHT = 96, 64
 RED, GREEN, BLUE = (200, 30, 20), (20, 180, 40), (30, 60, 220)
@@ -222,7 +230,7 @@ def test_another_tint_of_the_same_camera_projects_nothing(drawer, objects, monke
         for selection in (None, selection_of(LEFT)):
             drawer.picture(camera(), mode=mode, objects=objects, selection=selection)
     drawer.id_map(camera(), np.zeros(COUNT, np.int32))
-    drawer.depth(camera(), 48.0, 32.0)
+    drawer.surface(camera(), [(48.0, 32.0)])
     assert len(made) == 1
     lenses = [{"fx": 81.0}, {"fx": 81.0, "fy": 81.0}, {"cx": 47.0}, {"cx": 47.0, "cy": 33.0}]
     lenses += [{"model": "opencv"}, {"model": "opencv", "distortion": (0.1,)}]
@@ -275,35 +283,54 @@ def test_id_map_names_the_strongest(drawer) -> None:
     assert int(alone[RIGHT_PIXEL]) == 7
 
 
-def test_depth_is_the_world_point_under_a_pixel(scene, drawer) -> None:
-    row, column = LEFT_PIXEL
+def test_the_surface_is_the_world_points_under_pixels(scene, drawer) -> None:
+    (row, column), (low, right) = LEFT_PIXEL, BEHIND_PIXEL
     for eye in (camera(), camera(right=0.2)):
-        point = drawer.depth(eye, column + 0.25, row + 0.75)
-        assert point is not None
+        nothing, point = drawer.surface(eye, [(2.5, 60.5), (column + 0.25, row + 0.75)])
+        assert nothing is None
         assert point.shape == (3,)
         assert point[2] == pytest.approx(4, abs=1e-4)
         pixels, _ = eye.project(torch.from_numpy(point))
         assert pixels.tolist() == pytest.approx([column + 0.25, row + 0.75], abs=1e-6)
         median = float(render(scene.gaussians, eye).median_depth[row, column])
         assert point[2] == pytest.approx(median, abs=1e-5)
-    row, column = BEHIND_PIXEL
-    behind = drawer.depth(camera(), column + 0.5, row + 0.5)
-    assert behind is not None
+    (behind,) = drawer.surface(camera(), [(right + 0.5, low + 0.5)])
     assert behind[2] == pytest.approx(8, abs=1e-4)
-    assert drawer.depth(camera(), column + 0.5, row + 0.5, shown=LEFT) is None
+    assert drawer.surface(camera(), [(right + 0.5, low + 0.5)], shown=LEFT) == [None]
+    assert drawer.surface(camera(), []) == []
 
 
-def test_depth_is_of_the_pixel_that_a_point_lies_in(scene, drawer) -> None:
+def test_the_surface_is_of_the_pixel_that_a_point_lies_in(scene, drawer) -> None:
     there = render(scene.gaussians, camera()).median_depth[32] > 0
     last = int(torch.nonzero(there[:48])[-1])
     assert not there[last + 1]
-    assert drawer.depth(camera(), last + 0.95, 32.95) is not None
-    assert drawer.depth(camera(), last + 1.05, 32.5) is None
+    found, none = drawer.surface(camera(), [(last + 0.95, 32.95), (last + 1.05, 32.5)])
+    assert found is not None
+    assert none is None
 
 
 @pytest.mark.parametrize("pixel", [(2.5, 60.5), (-0.5, 32), (28, -0.5), (96, 32), (28, 64)])
-def test_where_nothing_is_there_is_no_depth(drawer, pixel) -> None:
-    assert drawer.depth(camera(), *pixel) is None
+def test_where_nothing_is_there_is_no_surface(drawer, pixel) -> None:
+    assert drawer.surface(camera(), [pixel]) == [None]
+
+
+def test_pictures_of_values_say_what_their_colours_stand_for(scene, drawer) -> None:
+    assert drawer.picture(camera()).ends is None
+    assert drawer.picture(camera(), mode="objects").ends is None
+    assert drawer.picture(camera(), mode="confidence").ends == (0.0, 1.0)
+    assert drawer.picture(camera(), mode="similarity").ends is None
+    similar = np.linspace(0.2, 0.7, COUNT, dtype=np.float32)
+    low, high = drawer.picture(camera(), mode="similarity", similarity=similar).ends
+    assert (low, high) == pytest.approx((0.205, 0.7), abs=1e-5)
+    far, near = drawer.picture(camera(), mode="depth").ends
+    drawn = render(scene.gaussians, camera())
+    covered = drawn.depth[drawn.alpha > 0.5].numpy()
+    assert (near, far) == pytest.approx(tuple(np.percentile(covered, (2, 98))), abs=1e-4)
+    away = replace(camera(), cam_from_world=torch.diag(torch.tensor([-1.0, 1, -1, 1]).double()))
+    assert drawer.picture(away, mode="depth").ends is None
+    assert RAMP_STOPS[0] == "#440154"
+    assert RAMP_STOPS[-1] == "#fde725"
+    assert len(RAMP_STOPS) == 18
 
 
 def test_scale_draws_the_same_smaller(drawer) -> None:
@@ -334,6 +361,17 @@ def test_jpeg_is_the_picture(drawer) -> None:
     assert near(decoded[LEFT_PIXEL][::-1], RED, 12)
 
 
+def test_a_view_without_a_photograph_is_drawn_in_its_place(drawer, scene) -> None:
+    bare = scene.view("bare").camera
+    found = cv2.imdecode(np.frombuffer(drawer.photograph("bare", 50), np.uint8), cv2.IMREAD_COLOR)
+    assert found is not None
+    size = (50, round(50 * bare.height / bare.width))
+    wanted = drawer.picture(bare.resized(*size)).rgb
+    assert found.shape == wanted.shape
+    assert np.abs(found[..., ::-1].astype(int) - wanted).mean() < 6  # JPEG
+    assert wanted.max() > 100
+
+
 def test_photographs_are_reduced_kept_and_bounded(drawer, scene, monkeypatch) -> None:
     first = drawer.photograph("first", 50)
     decoded = cv2.imdecode(np.frombuffer(first, np.uint8), cv2.IMREAD_COLOR)
@@ -362,8 +400,6 @@ def test_photographs_are_reduced_kept_and_bounded(drawer, scene, monkeypatch) ->
     monkeypatch.setattr(_draw, "_PHOTOGRAPHS", 1)
     assert drawer.photograph("first", 40)
     assert cv2.imdecode(np.frombuffer(drawer.photograph("first", 1), np.uint8), 1).shape[1] == 16
-    with pytest.raises(InputError, match="bare"):
-        drawer.photograph("bare", 50)
     with pytest.raises(InputError, match="nowhere"):
         drawer.photograph("nowhere", 50)
 

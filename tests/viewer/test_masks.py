@@ -1,6 +1,7 @@
 """Masks by their content, in memory and in a folder, and files that are damaged."""
 
 import os
+import tempfile
 import zlib
 
 import numpy as np
@@ -117,6 +118,40 @@ def test_few_masks_are_kept_as_arrays(tmp_path, monkeypatch) -> None:
     first = store.get(made[3])
     store.get(made[0])
     assert store.get(made[3]) is first, "the one that was used last stays"
+
+
+def test_many_masks_without_a_folder_go_to_a_temporary_one(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(_masks, "_PACKED_BYTES", 40)
+    monkeypatch.setattr(_masks, "_KEPT_BYTES", 3)
+    store = MaskStore(3)
+    made = [store.put(values(i, 0, 255)) for i in range(9)]
+    (folder,) = tmp_path.iterdir()
+    written = {path.name for path in folder.iterdir()}
+    assert 0 < len(written) < 9
+    assert {f"{mask.id}.z" for mask in made} - written == {f"{id}.z" for id in store._packed}
+    assert sum(map(len, store._packed.values())) == store._packed_bytes <= 40
+    assert all(mask in store for mask in made)
+    assert [int(store.get(mask)[0]) for mask in made] == list(range(9))
+    assert store.put(values(0, 0, 255)) == made[0]
+    assert made[0].id not in store._packed, "it is in the folder already"
+    store.close()
+    assert not folder.exists()
+    assert made[0] not in store
+
+
+def test_what_went_to_the_temporary_folder_is_written_when_it_is_asked_for(
+    tmp_path, monkeypatch
+) -> None:
+    monkeypatch.setattr(_masks, "_PACKED_BYTES", 0)
+    store = MaskStore(3, tmp_path / "masks")
+    mask, other = store.put(values(0, 0, 255)), store.put(values(0, 255, 0))
+    assert not (tmp_path / "masks").exists()
+    store.persist([mask])
+    store.close()
+    fresh = MaskStore(3, tmp_path / "masks")
+    assert fresh.get(mask).tolist() == [0, 0, 255]
+    assert other not in fresh
 
 
 def test_what_a_killed_process_left_is_cleared(tmp_path) -> None:

@@ -32,6 +32,8 @@ def without(value: dict[str, object], name: str) -> dict[str, object]:
     ("value", "kind"),
     [
         ({"type": "hello", "version": 1}, messages.Hello),
+        ({"type": "hello", "version": 1, "stage": "gpu"}, messages.Hello),
+        ({"type": "stage", "stage": "gpu"}, messages.StageRequest),
         (DRAW, messages.DrawRequest),
         (SELECT, messages.SelectRequest),
         ({"type": "command", "name": "keep", "arguments": {}, "revision": 3},
@@ -49,6 +51,16 @@ def test_each_type_is_a_class_of_its_own(value, kind) -> None:
     assert type(parsed(value)) is kind
 
 
+def test_a_camera_may_show_a_move_under_way() -> None:
+    plain = parsed(DRAW)
+    assert isinstance(plain, messages.DrawRequest)
+    assert plain.preview is None
+    motion = {"ids": None, "translation": [1, 2, 3], "scale": 2, "about": [0, 0, 1]}
+    moved = parsed({**DRAW, "preview": motion})
+    assert isinstance(moved, messages.DrawRequest)
+    assert moved.preview == messages.Move(translation=(1, 2, 3), scale=2, about=(0, 0, 1))
+
+
 def test_defaults_are_those_of_the_protocol() -> None:
     drawn, selected = parsed(DRAW), parsed(SELECT)
     assert isinstance(drawn, messages.DrawRequest)
@@ -61,6 +73,10 @@ def test_defaults_are_those_of_the_protocol() -> None:
 
 
 REFUSED = {
+    "a hello of no known stage": {"type": "hello", "version": 1, "stage": "tpu"},
+    "no known stage": {"type": "stage", "stage": "forced"},
+    "a stage of nothing": {"type": "stage"},
+    "a stage with more": {"type": "stage", "stage": "gpu", "path": "/"},
     "no type": without(DRAW, "type"),
     "another type": {"type": "exec"},
     "a list": [1],
@@ -83,6 +99,10 @@ REFUSED = {
     "a far place": {**DRAW, "matrix": [1, 0, 0, 1e300, *EYE[4:]]},
     "another mode": {**DRAW, "mode": "../secret"},
     "an object below 0": {**DRAW, "only": -5},
+    "a preview of another form": {**DRAW, "preview": {"colour": [1, 2, 3]}},
+    "a preview of no size": {**DRAW, "preview": {"scale": 0}},
+    "a preview turned by nothing": {**DRAW, "preview": {"rotation": [0, 0, 0, 0]}},
+    "a preview far away": {**DRAW, "preview": {"translation": [1e10, 0, 0]}},
     "another kind": {**SELECT, "kind": "everything"},
     "points of three": {**SELECT, "points": [[1, 2, 3]]},
     "too many points": {**SELECT, "points": [[1, 2]] * 4001},
@@ -258,6 +278,17 @@ def test_an_id_map_has_its_head_and_its_rows() -> None:
     assert data[:1] == b"I"
     assert struct.unpack_from("<IHH", data, 1) == (7, 3, 2)
     assert zlib.decompress(data[9:]) == b"\0\0\1\0\2\0\xff\xff\0\1\3\0"
+
+
+def test_streams_have_their_head_and_a_value_of_each_gaussian() -> None:
+    codes = np.array([0, 1, 4095, 258], dtype=np.uint16)
+    data = messages.codes_bytes(2**32 - 1, codes)
+    assert struct.unpack("<cII", data[:9]) == (b"O", 2**32 - 1, 4)
+    assert zlib.decompress(data[9:]) == bytes([0, 0, 1, 0, 255, 15, 2, 1])
+    members = np.array([True, False, True, False, False, False, False, True, False, True])
+    data = messages.selection_bytes(3, members)
+    assert struct.unpack("<cII", data[:9]) == (b"S", 3, 10)
+    assert zlib.decompress(data[9:]) == bytes([0b10100001, 0b01000000])
 
 
 def test_words_that_python_reserves_are_written_as_the_protocol_has_them() -> None:

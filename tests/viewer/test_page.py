@@ -1,5 +1,6 @@
 """The page: its modules run in Node; its files hold to its CSP and to the rules of the house."""
 
+import hashlib
 import re
 import subprocess
 import sys
@@ -14,6 +15,7 @@ import splatseg
 STATIC = Path(splatseg.__file__).parent / "viewer" / "static"
 UNITS = sorted((Path(__file__).parent / "page").glob("*.test.mjs"))
 MODULES = sorted(STATIC.rglob("*.js"))
+VENDOR = STATIC / "vendor"
 STYLES = sorted(STATIC.glob("*.css"))
 _LINES = 500
 _IMPORT = re.compile(r'(?:^import|^\} from|^export .* from).*?"(\.[^"]+)"', re.MULTILINE)
@@ -109,6 +111,22 @@ def test_each_style_sheet_is_linked(page: _Page) -> None:
     links = [a["href"] for tag, a in page.elements if tag == "link" and a["rel"] == "stylesheet"]
     assert sorted(str(link) for link in links) == [f"/static/{file.name}" for file in STYLES]
     assert (STATIC / "icon.svg").is_file()
+
+
+def test_what_others_wrote_is_as_they_published_it() -> None:
+    sums = dict(
+        line.split()[::-1] for line in (VENDOR / "SHA256SUMS").read_text("utf-8").splitlines()
+    )
+    assert {file.name for file in VENDOR.iterdir()} == {*sums, "SHA256SUMS"}
+    for name, digest in sums.items():
+        assert hashlib.sha256((VENDOR / name).read_bytes()).hexdigest() == digest, name
+    # `sums` lies beside the files: whoever changes both changes this line, too.
+    assert sums["playcanvas-2.23.3.min.mjs"].startswith("3b014294ecd91bcefc11b53e5196ae41")
+    engine = (STATIC / "stage" / "engine.js").read_text("utf-8")
+    assert re.findall(r"vendor/([\w.-]+)", engine) == ["playcanvas-2.23.3.min.mjs"]
+    licence = (VENDOR / "playcanvas-LICENSE").read_text("utf-8")
+    assert "Copyright (c) 2011-2026 PlayCanvas Ltd." in licence
+    assert "Permission is hereby granted, free of charge" in licence
 
 
 def _words(pattern: str) -> set[str]:

@@ -2,17 +2,23 @@
 
 import io
 import json
+import re
+import shutil
+import sys
 import threading
 import time
 import zipfile
+from dataclasses import replace
+from typing import Any
 
 import httpx
 import numpy as np
 import pytest
+import torch
 from websockets.exceptions import ConnectionClosed
 
 from splatseg.errors import InputError
-from splatseg.io.scene import load_scene
+from splatseg.io.scene import load_scene, save_scene, save_scene_layer
 from splatseg.viewer._job_process import main
 from splatseg.viewer._server import ViewServer
 from support.viewer import (
@@ -105,6 +111,51 @@ def test_modes_and_one_object_alone(page) -> None:
         assert page.still(id, mode=mode).size == (WIDTH, HEIGHT)
     page.draw(9, only=77)
     assert "77" in page.next("error")["text"]
+
+
+def test_pictures_of_values_have_a_legend_once_while_it_is_the_same(page) -> None:
+    ramp = page.heard[0]["ramp"]
+    assert (ramp[0], ramp[-1]) == ("#440154", "#fde725")
+    start = len(page.heard)
+    for id, mode in enumerate(("colour", "confidence", "confidence", "depth", "colour"), start=1):
+        page.still(id, mode=mode)
+    page.draw(9, mode="depth")  # in motion nothing is said
+    page.frame(9)
+    page.send("hint")
+    page.next("hint")
+    said = [one for one in page.heard[start:] if isinstance(one, dict) and one["type"] == "legend"]
+    assert [one["mode"] for one in said] == ["colour", "confidence", "depth", "colour"]
+    assert [one["ends"] for one in said[::3]] == [None, None]
+    assert said[1]["ends"] == [0, 1]
+    far, near = said[2]["ends"]
+    assert 3 < near < 4 < far < 8
+
+
+def test_a_move_under_way_is_drawn_and_nothing_is_changed(page) -> None:
+    page.select(1, points=[RED_PIXEL])
+    plain = page.still(1)
+    there = (26, 20)
+    assert plain.rgb(*RED_PIXEL)[0] > 100 > plain.rgb(*there)[0]
+    preview = {"ids": None, "translation": [0, 0, 0.8]}
+    moved = page.still(2, preview=preview)
+    assert moved.rgb(*there)[0] > 100
+    assert moved.rgb(*RED_PIXEL)[0] < 60
+    assert np.array_equal(page.still(3).bgr, plain.bgr)
+    page.command("keep", name="mug")
+    moved = page.still(4, preview=preview | {"ids": [1]})
+    assert moved.rgb(*there)[0] > 100
+    for gone in (preview, preview | {"ids": [7]}):
+        assert page.still(5, preview=gone).rgb(*RED_PIXEL)[0] > 100, "there is nothing to move"
+    page.command("select_object", id=1)
+    patch = page.command("move", translation=[0, 0, 0.8])
+    assert patch["selection"]["centre"][2] == pytest.approx(0.8, abs=0.1)
+    assert patch["objects"][0]["centre"] == patch["selection"]["centre"]
+    assert page.select(2, points=[there])["count"] == pytest.approx(EACH, abs=15)
+    page.send("undo")
+    assert page.next("patch")["objects"] == []
+    page.send("undo")
+    back = page.next("patch")["objects"][0]["centre"]
+    assert back[2] == pytest.approx(0, abs=0.1)
 
 
 def test_the_id_map_names_what_is_under_each_pixel(page) -> None:
@@ -524,12 +575,130 @@ def test_the_process_of_a_job_says_how_far_it_is_and_how_it_ends(things) -> None
     assert status == 0
     assert all(set(line) == {"done", "total", "text"} for line in lines[:-1])
     assert (lines[-2]["done"], lines[-2]["total"]) == (1, 1)
-    assert lines[-1] == {"text": "masks of 1 views by classical"}
-    assert said("associate")[1][-1] == {"text": "layer masks"}
+    assert lines[-1] == {"text": "masks of 1 view by classical"}
+    assert said("see")[1] == [{"text": "masks are at hand"}]
+    assert re.fullmatch(r"\d+ objects? in layer masks", said("associate")[1][-1]["text"])
     assert set(load_scene(things).layers) == {"masks", "things"}
+    # What was made in another way is not replaced, what was associated is.
+    save_scene_layer(load_scene(things).layers["things"], things, "masks")
+    assert said("associate")[1][-1]["text"].endswith(" in layer masks_2")
+    assert said("associate")[1][-1]["text"].endswith(" in layer masks_2")
     status, lines = said("see", model="../masks")
     assert status == 2
     assert "expected one of" in lines[-1]["error"]
+
+
+def test_what_is_at_hand_makes_masks(things, monkeypatch) -> None:
+    from splatseg import models
+    from splatseg.errors import MissingFileError
+    from splatseg.viewer import _job_process
+
+    asked: list[str] = []
+
+    def find(name: str) -> str:
+        asked.append(name)
+        if name == "sam":
+            return "the model"
+        raise MissingFileError("weights: not on this machine.")
+
+    monkeypatch.setattr(models, "find_model", find)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert _job_process._model_at_hand() == "classical"
+    assert asked == []
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    assert _job_process._model_at_hand() == "the model"
+    assert asked == ["sam2", "sam-hq", "sam"]
+
+
+def test_masks_at_hand_cover_all_views_those_of_sam_first(things) -> None:
+    from splatseg.tasks.work import Work
+    from splatseg.viewer._job_process import masks_at_hand
+
+    def at_hand() -> str | None:
+        return masks_at_hand(Work(scene=load_scene(things)))
+
+    assert at_hand() is None
+    main(["see", str(things), "cpu"], io.StringIO("{}"), io.StringIO())
+    assert at_hand() == "masks"
+    shutil.copytree(things / "evidence" / "masks", things / "evidence" / "big_sam")
+    assert at_hand() == "big_sam"
+    for path in (things / "evidence" / "big_sam").glob("first*"):
+        path.unlink()
+    assert at_hand() == "masks"
+
+
+def test_masks_that_were_stopped_are_gone_on_with(things, monkeypatch) -> None:
+    from splatseg.models.classical import Classical
+
+    views = load_scene(things)
+    second = replace(views.views[0], name="second")
+    save_scene(replace(views, views=(*views.views, second)), things)
+    masks, seen = Classical.masks, []
+
+    def stopped(self, image):
+        seen.append(image)
+        if len(seen) == 2:
+            raise KeyboardInterrupt
+        return masks(self, image)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Classical, "masks", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            main(["see", str(things), "cpu"], io.StringIO("{}"), io.StringIO())
+    out = io.StringIO()
+    assert main(["see", str(things), "cpu"], io.StringIO("{}"), out) == 0
+    assert "masks of 2 views by classical" in out.getvalue()
+
+
+def test_a_job_ends_with_the_server(serving, things, monkeypatch) -> None:
+    from splatseg.viewer import _jobs
+
+    started: list[Any] = []
+    popen = _jobs.subprocess.Popen
+
+    def start(command, **options):
+        started.append(popen([sys.executable, "-c", "import time; time.sleep(600)"], **options))
+        return started[0]
+
+    monkeypatch.setattr(_jobs.subprocess, "Popen", start)
+    server = serving()
+    with opened(server) as page:
+        page.send("job", id=1, name="see")
+        page.still(1)
+        while not started:
+            time.sleep(0.01)
+        began = time.monotonic()
+        server.close()
+    assert time.monotonic() - began < 5
+    assert started[0].poll() is not None, "it does not outlive the server"
+
+
+def test_after_a_layer_was_made_the_first_click_is_prepared(page, monkeypatch) -> None:
+    from splatseg.viewer import _jobs
+    from splatseg.viewer import _messages as messages
+    from splatseg.viewer._session import Session
+
+    prepared: list[int] = []
+    monkeypatch.setattr(Session, "prepare", lambda self: prepared.append(1))
+
+    def begin(job, root, backend, given, done):
+        thread = threading.Thread(target=lambda: done(endings.pop()))
+        thread.start()
+        return thread
+
+    endings: list[Any] = [
+        messages.Finished(id=2, result={}),
+        messages.Error(text="cancelled", id=1),
+    ]
+    monkeypatch.setattr(_jobs, "start_process", begin)
+    page.send("job", id=1, name="associate")
+    assert finished(page, 1)["type"] == "error"
+    page.still(1)
+    assert prepared == []
+    page.send("job", id=2, name="associate")
+    assert finished(page, 2)["type"] == "finished"
+    page.still(2)
+    assert prepared == [1]
 
 
 def test_an_error_in_an_answer_leaves_the_server_running(page, monkeypatch, caplog) -> None:

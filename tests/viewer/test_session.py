@@ -36,10 +36,10 @@ from splatseg.io.splats import read_splats, write_splats
 from splatseg.prompting.graph import build_graph, holes
 from splatseg.prompting.prompts import AxisBox, Ball, Similar, ViewPrompt
 from splatseg.tasks import SelectOptions, open_selector
-from splatseg.viewer._products import Owners, similarity_of
 from splatseg.viewer._selecting import bytes_of, front_view, selection_of
 from splatseg.viewer._session import Session, open_session
 from splatseg.viewer._shaping import combined
+from splatseg.viewer._shown import Owners, similarity_of
 from splatseg.viewer._state import Document
 from splatseg.viewer.commands import (
     Accept,
@@ -607,10 +607,10 @@ def test_a_gaussian_belongs_to_the_object_that_is_surest_of_it(session) -> None:
     one = keep(session, "one", rows < 500, 200)
     two = keep(session, "two", (rows >= 400) & (rows < 600), 150)
     assert np.array_equal(
-        session.owners(), np.where(rows < 500, one, np.where(rows < 600, two, -1))
+        session.shown.owners, np.where(rows < 500, one, np.where(rows < 600, two, -1))
     )
     three = keep(session, "three", (rows >= 300) & (rows < 450), 200)
-    found = session.owners()
+    found = session.shown.owners
     assert set(found[300:450]) == {three}
     assert set(found[450:500]) == {one}
     assert set(found[500:600]) == {two}
@@ -625,7 +625,7 @@ def test_owners_kept_are_owners_found_anew(given) -> None:
     for step in given:
         if done(step, session.do, session):
             anew = Owners(COUNT, session.masks).of(session.document.objects)
-            assert np.array_equal(session.owners(), anew[0])
+            assert np.array_equal(session.shown.owners, anew[0])
             naive = np.full(COUNT, -1)
             best = np.full(COUNT, 127)
             for one in session.document.objects:
@@ -633,24 +633,24 @@ def test_owners_kept_are_owners_found_anew(given) -> None:
                 for i in range(COUNT):
                     if values[i] >= 128 and values[i] >= best[i]:
                         naive[i], best[i] = one.id, values[i]
-            assert np.array_equal(session.owners(), naive)
+            assert np.array_equal(session.shown.owners, naive)
 
 
 def test_what_is_hidden_removed_or_not_isolated_is_not_shown(session) -> None:
     rows = np.arange(1000)
-    assert session.visible.all()
+    assert session.shown.visible.all()
     one = keep(session, "one", rows < 500, 200)
     two = keep(session, "two", (rows >= 400) & (rows < 600), 150)
     session.do(SetVisible((one,), False))
-    assert np.array_equal(session.visible, rows >= 500)
+    assert np.array_equal(session.shown.visible, rows >= 500)
     session.do(Apply(Edit(kind="remove", mask=put(session.masks, *range(550, 700)))))
     removed = (rows >= 550) & (rows < 700)
-    assert np.array_equal(session.visible, (rows >= 500) & ~removed)
+    assert np.array_equal(session.shown.visible, (rows >= 500) & ~removed)
     session.do(Isolate((two,)))
-    assert np.array_equal(session.visible, (rows >= 500) & (rows < 550))
+    assert np.array_equal(session.shown.visible, (rows >= 500) & (rows < 550))
     session.do(Isolate((one, two)))
     session.do(SetVisible((one,), True))
-    assert np.array_equal(session.visible, (rows < 600) & ~removed)
+    assert np.array_equal(session.shown.visible, (rows < 600) & ~removed)
 
 
 # Several people.
@@ -731,12 +731,14 @@ def test_what_was_seen_before_a_restart_is_old(folder) -> None:
 def test_labels_say_what_was_done(session) -> None:
     keep(session, "mug", np.arange(1000) < 5)
     session.do(Rename(1, "cup"))
-    assert session.labels_of_commands == ("Select 5 Gaussians", "Keep mug", "Rename mug")
-    assert (session.undo_label, session.redo_label) == ("Rename mug", None)
+    history = session.history
+    labels = [entry.label for entry in history.entries]
+    assert labels == ["Select 5 Gaussians", "Keep mug", "Rename mug"]
+    assert (history.undo_label, history.redo_label) == ("Rename mug", None)
     session.undo()
     assert session.document.object(1).name == "mug"
-    assert (session.undo_label, session.redo_label) == ("Keep mug", "Rename mug")
-    assert session.labels_of_commands == ("Select 5 Gaussians", "Keep mug")
+    assert (history.undo_label, history.redo_label) == ("Keep mug", "Rename mug")
+    assert [entry.label for entry in history.entries] == labels[:2]
     assert session.revision == 4
     session.redo()
     assert session.document.object(1).name == "cup"
@@ -915,7 +917,7 @@ def test_edits_are_those_of_edit_one_after_the_other(session, scene) -> None:
     session.do(Apply(Edit(kind="recolour", mask=put(masks, *range(200)), colour=(255, 0, 51))))
     made = session.edited_scene()
     kept = np.concatenate((rows[:50], rows[150:], rows[:100]))
-    assert np.array_equal(session.edited_rows(), kept)
+    assert np.array_equal(session.shown.rows, kept)
     assert made.root is None
     assert [one["kind"] for one in made.provenance["view_edits"]] == [
         "move", "duplicate", "remove", "recolour",
@@ -942,7 +944,7 @@ def test_edits_of_what_was_removed_do_nothing(session) -> None:
     mask = put(session.masks, *range(50))
     session.do(Apply(Edit(kind="remove", mask=mask)))
     session.do(Apply(Edit(kind="duplicate", mask=mask, translation=(1, 0, 0))))
-    assert np.array_equal(session.edited_rows(), np.arange(50, 1000))
+    assert np.array_equal(session.shown.rows, np.arange(50, 1000))
 
 
 def test_the_movement_of_an_edit_keeps_the_point_that_it_is_about() -> None:

@@ -103,6 +103,19 @@ def test_a_second_process_is_refused_in_a_sentence(things, run) -> None:
     assert errors.count("\n") == 1
 
 
+@pytest.mark.parametrize(
+    ("words", "stage"),
+    [((), "server"), (("--stage", "auto"), "server"), (("--stage", "server"), "server"),
+     (("--stage", "gpu"), "gpu")],
+)  # fmt: skip
+def test_the_stage_that_the_page_begins_with(things, run, monkeypatch, words, stage) -> None:
+    def look(page: Page) -> None:
+        assert page.heard[0]["stage"] == stage
+
+    meanwhile(monkeypatch, look)
+    assert run("view", things, "--no-open", "--quiet", *words)[0] == 0
+
+
 @pytest.fixture
 def file(things, tmp_path) -> Path:
     """A splat file of the things."""
@@ -192,11 +205,12 @@ def test_a_fit_is_shown_as_its_checkpoints_come(things, tmp_path, run, monkeypat
         shutil.copy(things / "scene.json", folder)
         state = page.next("state")
         assert state["fitting"] is None
+        assert (state["stage"], page.heard[0]["stage"]) == ("gpu", "gpu")
         assert state["views"]
         page.select(1, points=[RED_PIXEL])
 
     meanwhile(monkeypatch, look)
-    assert run("view", folder, "--no-open")[0] == 0
+    assert run("view", folder, "--no-open", "--stage", "gpu")[0] == 0
     assert (folder / "view" / "journal.jsonl").is_file()
 
 

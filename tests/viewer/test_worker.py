@@ -5,13 +5,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 import torch
 
 from splatseg.errors import InputError
 from splatseg.viewer import _guard as guard
 from splatseg.viewer import _messages as messages
-from splatseg.viewer._worker import Client, Job, Worker
+from splatseg.viewer._client import Client, Job
+from splatseg.viewer._worker import Worker
 from support.viewer import json_camera
 
 
@@ -150,6 +152,29 @@ def test_a_change_is_drawn_first_for_who_made_it(worker, noted) -> None:
     assert settled(worker, noted) == [("draw", 2, 2), ("draw", 1, 1)]
     assert pages[0].camera is not None
     assert pages[0].camera.rest
+
+
+def test_a_move_that_was_made_is_not_drawn_as_under_way(worker, noted) -> None:
+    first, second = joined(worker), joined(worker)
+    asked: list[messages.DrawRequest] = []
+    noted.draw = lambda client, request: asked.append(request)
+    under_way = messages.Move(translation=(1.0, 0.0, 0.0))
+    moving = msgspec.structs.replace(camera(1), preview=under_way)
+    worker.give(first, moving)
+    settled(worker, noted)
+    assert asked.pop().preview == under_way
+    worker.call(lambda _: worker.redraw("1")).result(10)
+    settled(worker, noted)
+    assert asked.pop().preview is None, "the last camera again, at rest"
+    for author, expected in (("1", None), ("2", under_way)):
+        held(worker, noted, second)
+        first.busy = True
+        worker.give(first, moving)
+        worker.redraw(author)
+        first.busy = False
+        settled(worker, noted)
+        assert asked.pop().preview == expected
+    assert not asked
 
 
 def test_between_two_rounds_of_cameras_one_message_is_answered(worker, noted) -> None:

@@ -179,8 +179,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     if debug:
         words = [word for word in words if word != "--debug"]
     prepare_streams()
+    signals: list[int] = []
     try:
-        with interrupted_by_signals(), _unpacking(words) as words:
+        with interrupted_by_signals() as signals, _unpacking(words) as words:
             status = _dispatch(words)
         sys.stdout.flush()
     except BrokenPipeError:
@@ -198,6 +199,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except OSError as error:
         return _report_system(error, debug=debug)
     except Exception as error:  # noqa: BLE001  (the last resort: one line, not a traceback)
+        if signals:  # what was being imported or set up broke
+            tell(sys.stderr, "interrupted\n")
+            return EXIT_FAILED
         sentence = f"{type(error).__name__}: {error} (add --debug for the traceback)"
         return _report(error, sentence, status=EXIT_FAILED, debug=debug)
     return status

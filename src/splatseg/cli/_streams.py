@@ -50,23 +50,29 @@ _SIGNALS = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if getattr(s
 
 
 @contextmanager
-def interrupted_by_signals() -> Generator[None]:
+def interrupted_by_signals() -> Generator[list[int]]:
     """Raise `KeyboardInterrupt` where these signals would end the process at once.
 
-    One that is ignored, as by ``nohup``, stays so. Work that answers signals itself does.
+    One that is ignored, as by ``nohup``, stays so. Work that answers signals itself does. Gives
+    the list of those that came, Ctrl-C among them: an import that it breaks off may fail in
+    another way.
     """
+    came: list[int] = []
     if threading.current_thread() is not threading.main_thread():
-        yield
+        yield came
         return
-    changed = [number for number in _SIGNALS if signal.getsignal(number) == signal.SIG_DFL]
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        came.append(number)
+        raise KeyboardInterrupt
+
+    usual = (signal.SIG_DFL, signal.default_int_handler)
+    before = {number: signal.getsignal(number) for number in (*_SIGNALS, signal.SIGINT)}
+    changed = {number: handler for number, handler in before.items() if handler in usual}
     for number in changed:
-        signal.signal(number, _interrupt)
+        signal.signal(number, interrupt)
     try:
-        yield
+        yield came
     finally:
-        for number in changed:
-            signal.signal(number, signal.SIG_DFL)
-
-
-def _interrupt(number: int, frame: FrameType | None) -> None:
-    raise KeyboardInterrupt
+        for number, handler in changed.items():
+            signal.signal(number, handler)

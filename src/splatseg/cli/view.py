@@ -10,7 +10,7 @@ from collections.abc import Generator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -70,6 +70,11 @@ class Command(Printing):
 
     backend: Backend = "auto"
 
+    stage: Literal["auto", "server", "gpu"] = "auto"
+    """Who draws while the camera moves. server: this machine. gpu: the page, where its browser has
+    a GPU that is quick enough. auto is server: gpu is new and has not been seen on many GPUs. The
+    page's settings change it."""
+
 
 def run(command: Command) -> None:
     """Serve a scene until Ctrl-C."""
@@ -96,17 +101,20 @@ def _served(command: Command) -> Generator[ViewServer]:
             f"whoever has the link and reaches {command.host} can look at the scene and change "
             "its objects; the connection is not encrypted"
         )
+    stage = "gpu" if command.stage == "gpu" else "server"
     with ExitStack() as stack:
         fitting = None
         if is_unfinished(command.scene):
             fitting = FittingScene(
-                command.scene, capture=_capture(command), backend=command.backend
+                command.scene, capture=_capture(command), backend=command.backend, stage=stage
             )
             worker = Worker(fitting.open)
         else:
             folder = stack.enter_context(_scene_folder(command))
             scene = load_scene(folder, data=command.data)
-            worker = Worker(opener(scene, layer=command.layer, backend=command.backend))
+            worker = Worker(
+                opener(scene, layer=command.layer, backend=command.backend, stage=stage)
+            )
         server = stack.enter_context(ViewServer(worker, host=command.host, port=command.port))
         if fitting is not None:
             stack.enter_context(FittingWatch(fitting, worker))
@@ -120,8 +128,12 @@ def _scene_folder(command: Command) -> Generator[Path]:
     if not path.exists():
         raise MissingFileError(f"{path}: there is no such scene, file or folder.")
     if not path.is_file():
-        if is_scene(path):
-            check_writable(path)  # what is done there is kept in it
+        if not is_scene(path):
+            raise InputError(
+                f"{path}: expected a scene folder, got none (no scene.json); `splatseg fit` makes "
+                "one of photographs, and a splat file is opened as it is."
+            )
+        check_writable(path)  # what is done there is kept in it
         yield path
         return
     if command.output is not None:

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from typing import overload
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from splatseg._check import check_shape, check_values
@@ -76,6 +76,23 @@ class Edited:
         return Edited(
             gaussians=later.gaussians, rows=rows, fractions=None if without else fractions
         )
+
+    def rows_before(self, mask: Bool[Tensor, "n"], count: int) -> Bool[Tensor, "count"]:
+        """The old rows of which a mask has at least one new row.
+
+        Args:
+            mask: New rows.
+            count: Old rows there are.
+
+        Raises:
+            ShapeError: If the mask has not one entry a new row, or there are more old rows.
+        """
+        check_shape("mask", mask, (len(self),))
+        _check_rows(self.rows, count)
+        found = torch.zeros(count, dtype=torch.bool)
+        chosen = self.rows[mask.to(self.rows.device)].cpu()
+        found[chosen[chosen != NEW]] = True
+        return found
 
 
 def _fractions(edited: Edited) -> Tensor:

@@ -252,7 +252,7 @@ class LayerSource:
             for pixel in () if one.dense else one.pixels[one.positive].cpu():
                 camera = one.view.camera
                 pixels, votes = neighbouring_pixels(pixel, camera.height, camera.width)
-                ids = shown_ids(self._labels, self._views.prepared(one.view).weights(pixels))
+                ids = shown_ids(self._labels, self._views.weights(one.view, pixels))
                 own = (pixels == pixel).all(dim=1)
                 said = own | torch.tensor([id not in hidden for id in ids.tolist()])
                 nearest.append(

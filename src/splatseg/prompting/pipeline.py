@@ -359,15 +359,18 @@ def _by_masks(
         if prompt.inside is None or prompt.guessed:
             continue
         labels = LabelMap(ids=prompt.inside.to(torch.int32))
+        # Rows of what the view shows, which after an edit are not the scene's.
+        shown = context.views.shown(prompt.view)
         found = view_masses(
-            context.gaussians, prompt.view.camera, labels, backend=context.views.backend
+            shown.gaussians, prompt.view.camera, labels, backend=context.views.backend
         )
         own = found.segment == 1
-        within = torch.zeros(len(context.gaussians))
-        within[found.gaussian[own]] = found.weight[own]
-        seen = found.visible > _SEEN
-        good = seen & (within >= _INSIDE * found.visible)
-        bad = seen & (within < _INSIDE * found.visible)
+        within, visible = torch.zeros(2, len(context.gaussians))
+        within.index_add_(0, shown.rows[found.gaussian[own]], found.weight[own])
+        visible.index_add_(0, shown.rows, found.visible)
+        seen = visible > _SEEN
+        good = seen & (within >= _INSIDE * visible)
+        bad = seen & (within < _INSIDE * visible)
         validated = good if validated is None else validated & good
         excluded = bad if excluded is None else excluded | bad
     return validated, excluded

@@ -15,6 +15,7 @@ from splatseg.core import Gaussians, Selection, View
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.models import signs_of_points
 from splatseg.errors import InputError, RangeError, ShapeError
+from splatseg.neighbours import NeighbourIndex
 from splatseg.selection.where import box_corners, check_ball
 
 _CORNERS = 3
@@ -165,6 +166,36 @@ class Ball:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Balls:
+    """Balls of one size, such as a brush leaves along its way: what has its centre in one of them.
+
+    Raises:
+        ShapeError: If there is no ball.
+        RangeError: If a number is not finite, or the radius is not positive.
+    """
+
+    centres: Float[Tensor, "balls 3"]
+    """x, y, z of each, scene units."""
+
+    radius: float
+    """Scene units."""
+
+    def __post_init__(self) -> None:
+        convert_fields(self)
+        check_finite("centres", self.centres)
+        if not len(self.centres):
+            raise ShapeError("centres: expected at least one ball, got none.")
+        check_ball("sphere", (*self.centres[0].tolist(), self.radius))
+
+    @boundary
+    def contains(self, gaussians: Gaussians) -> Bool[Tensor, "n"]:
+        """Which Gaussians have their centre in one of them, or on its surface."""
+        index = NeighbourIndex(self.centres.double().cpu())
+        nearest = index.nearest(gaussians.means.double().cpu(), 1).distances[:, 0]
+        return (nearest <= self.radius).to(gaussians.device)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Lasso:
     """All that lies behind a polygon of a view, near and far: a prism of sight.
 
@@ -207,10 +238,10 @@ class Similar:
             raise InputError("similar: expected a selection of something, got an empty one.")
 
 
-Solid: TypeAlias = AxisBox | Ball | Lasso
+Solid: TypeAlias = AxisBox | Ball | Balls | Lasso
 """Prompts that are places: a Gaussian is in them or not."""
 
-SelectionPrompt: TypeAlias = ViewPrompt | AxisBox | Ball | Lasso | Similar
+SelectionPrompt: TypeAlias = ViewPrompt | AxisBox | Ball | Balls | Lasso | Similar
 """All that can be selected by."""
 
 

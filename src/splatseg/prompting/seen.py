@@ -11,8 +11,8 @@ refused.
 """
 
 from collections import OrderedDict
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Self
 
 import torch
@@ -20,11 +20,12 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from splatseg._check import check_shape
-from splatseg.core import Camera, Gaussians, View
+from splatseg.core import Camera, Edited, Gaussians, LabelMap, Labels, View, apply_rows
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.options import Count
 from splatseg.errors import InputError
-from splatseg.prompting.prompts import ViewPrompt, pixels_in_box
+from splatseg.lift.label_maps import view_label_map
+from splatseg.prompting.prompts import Lasso, Solid, ViewPrompt, pixels_in_box
 from splatseg.render import PreparedView, SparseWeights, prepare
 
 _CENTRAL = 0.5
@@ -42,24 +43,40 @@ MAX_PIXELS = 1024
 
 
 class ViewCache:
-    """Prepared views of some Gaussians, the latest few; a context that releases them.
+    r"""Prepared views of some Gaussians, the latest few; a context that releases them.
 
     To project and sort a view of 330 k Gaussians takes 50 ms, a row of its W then half of one.
+
+    A view may show the Gaussians as an edit made them: with P, which has a 1 where row j of the
+    edited ones comes from row i, what it says of the Gaussians is :math:`W P`.
 
     Args:
         gaussians: The Gaussians; they must stay as they are.
         backend: Rendering backend.
         capacity: How many views are kept, each some tens of megabytes; 1 or more.
-
+        edited: What a view shows instead of the Gaussians, an edit of them without new rows (None
+            for what it shows as it is); and what there is in the world, asked without a view. It
+            gives the same object while that is the same. Gaussians of opacity 0 are not shown.
     """
 
     @boundary
-    def __init__(self, gaussians: Gaussians, *, backend: str = "auto", capacity: Count = 4) -> None:
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        *,
+        backend: str = "auto",
+        capacity: Count = 4,
+        edited: Callable[[View | None], Edited | None] | None = None,
+    ) -> None:
         self._gaussians = gaussians
         self._backend = backend
         self._capacity = capacity
-        # The camera is kept as long as its number is a key, which therefore is nobody else's.
-        self._views: OrderedDict[int, tuple[Camera, PreparedView]] = OrderedDict()
+        self._edited = edited or _as_it_is
+        # Camera and edit are kept as long as their numbers are a key, which therefore is nobody
+        # else's.
+        self._views: OrderedDict[tuple[int, int], tuple[Camera, Edited | None, PreparedView]] = (
+            OrderedDict()
+        )
 
     def __enter__(self) -> Self:
         return self
@@ -82,22 +99,63 @@ class ViewCache:
 
     @boundary
     def prepared(self, view: View) -> PreparedView:
-        """The view, prepared; it stays open until as many others as are kept were asked for."""
-        key = id(view.camera)
+        """The view of what it shows; it stays open until as many others as are kept were asked for.
+
+        Its rows are those of `shown`.
+        """
+        edited = self._edited(view)
+        key = (id(view.camera), id(edited))
         if key in self._views:
             self._views.move_to_end(key)
-            return self._views[key][1]
-        made = prepare(self._gaussians, view.camera, backend=self._backend)
-        self._views[key] = (view.camera, made)
+            return self._views[key][2]
+        shown = self._gaussians if edited is None else edited.gaussians
+        made = prepare(shown, view.camera, backend=self._backend)
+        if edited is not None:
+            # An edit that was undone or went on holds a scene of Gaussians; it is let go.
+            for other, (_, before, _) in list(self._views.items()):
+                if before is not None and before is not edited:
+                    self._views.pop(other)[2].close()
+        self._views[key] = (view.camera, edited, made)
         while len(self._views) > self._capacity:
-            self._views.popitem(last=False)[1][1].close()
+            self._views.popitem(last=False)[1][2].close()
         return made
+
+    def shown(self, view: View | None = None) -> Edited:
+        """What a view shows, or what there is in the world, and which Gaussian each row is of."""
+        edited = self._edited(view)
+        return Edited.unchanged(self._gaussians) if edited is None else edited
+
+    def weights(self, view: View, pixels: Int64[Tensor, "p 2"]) -> SparseWeights:
+        """Rows of W of pixels of a view, columns and rows, over the Gaussians."""
+        found, edited = self.prepared(view).weights(pixels), self._edited(view)
+        if edited is None:
+            return found
+        ids = edited.rows.to(found.ids.device)[found.ids.long()].int()
+        return replace(found, ids=ids, gaussians=len(self._gaussians))
+
+    def label_map(self, view: View, labels: Labels) -> LabelMap:
+        """What a view shows of labels of the Gaussians."""
+        edited = self._edited(view)
+        shown = labels if edited is None else apply_rows(labels, edited)
+        return view_label_map(self.prepared(view), shown)
+
+    def inside(self, solid: Solid) -> Bool[Tensor, "n"]:
+        """Which Gaussians a place has: at least one that is shown of each."""
+        edited = self._edited(solid.view if isinstance(solid, Lasso) else None)
+        if edited is None:
+            return solid.contains(self._gaussians)
+        lit = edited.gaussians.opacities > 0
+        return edited.rows_before(solid.contains(edited.gaussians) & lit, len(self._gaussians))
 
     def close(self) -> None:
         """Release all views; they are prepared again when asked for."""
-        for _, prepared in self._views.values():
+        for _, _, prepared in self._views.values():
             prepared.close()
         self._views.clear()
+
+
+def _as_it_is(_: View | None) -> None:
+    """No view shows an edit."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -253,7 +311,7 @@ def _central(box: Float[Tensor, "4"], view: View) -> Tensor:
 
 def _seen_points(cache: ViewCache, prompt: ViewPrompt, inside: Tensor | None) -> VisiblePrompt:
     pixels = prompt.points.floor().long()
-    rows = cache.prepared(prompt.view).weights(pixels)
+    rows = cache.weights(prompt.view, pixels)
     dark = rows.row_sums() < _MIN_ALPHA
     if bool(dark.any()):
         x, y = prompt.points[dark.to(prompt.points.device)][0].tolist()
@@ -280,11 +338,10 @@ def _seen_region(
     max_pixels: int,
     generator: torch.Generator,
 ) -> VisiblePrompt:
-    prepared = cache.prepared(prompt.view)
     parts: list[tuple[SparseWeights, Tensor, bool]] = []
     for name, region, positive in shown:
         pixels = thinned(region, max_pixels, generator)
-        rows = prepared.weights(pixels)
+        rows = cache.weights(prompt.view, pixels)
         lit = torch.nonzero(rows.row_sums() >= _MIN_ALPHA).squeeze(1)
         if not len(lit):
             raise InputError(

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from splatseg.core import UNLABELLED, InstanceTree, Labels, View
 from splatseg.errors import InputError
-from splatseg.lift.label_maps import view_label_map
 from splatseg.prompting.seen import ViewCache
 
 _MOST = 0.5
@@ -64,7 +63,7 @@ def region_counts(
         inside: The region, not empty.
         boxed: Whether it is a box that was drawn.
     """
-    shown = view_label_map(views.prepared(view), labels).ids.cpu().long()
+    shown = views.label_map(view, labels).ids.cpu().long()
     ids, index = torch.unique(shown, return_inverse=True)
     flat, mask = index.flatten(), inside.cpu().flatten()
     boxes = _outlines(index, len(ids))

@@ -24,6 +24,7 @@ from splatseg.core import Camera, Gaussians
 from splatseg.core.boundary import boundary
 from splatseg.core.gaussians import LOW_PASS
 from splatseg.errors import InputError, RangeError
+from splatseg.render._picture import eight_bits, mixed_colours
 from splatseg.render._rows import SparseWeights
 from splatseg.render._values import (
     BackProjected,
@@ -46,6 +47,10 @@ class BackendView(ABC):
     Inputs were checked by the caller. What needs gradients towards the geometry is projected
     anew each time, because it becomes part of a graph.
     """
+
+    def __init__(self, gaussians: Gaussians, camera: Camera, options: RenderOptions) -> None:
+        self._gaussians, self._camera, self._options = gaussians, camera, options
+        self._closed = False
 
     def __enter__(self) -> Self:
         return self
@@ -74,20 +79,6 @@ class BackendView(ABC):
         """
 
     @abstractmethod
-    def picture(
-        self,
-        *,
-        tint: UInt8[Tensor, "n 4"] | None = None,
-        signal: Float[Tensor, "n channels"] | None = None,
-    ) -> UInt8[Tensor, "height width 3"]:
-        """`render` in eight bits, a tint mixed into the colours. On the CPU, without a gradient.
-
-        Args:
-            tint: Red, green, blue and how much of them; None is none.
-            signal: Grey (one channel) or colour; None is the colour of the SH.
-        """
-
-    @abstractmethod
     def back_project(self, image: Float[Tensor, "height width channels"]) -> BackProjected:
         """``W.T @ image`` and ``W.T @ 1``. No gradient."""
 
@@ -100,9 +91,31 @@ class BackendView(ABC):
         """Rows of W: all pixels or some, all entries or each pixel's k strongest."""
 
     @property
-    @abstractmethod
     def size(self) -> tuple[int, int]:
         """Height and width."""
+        return self._camera.height, self._camera.width
+
+    @torch.no_grad()
+    def picture(
+        self,
+        *,
+        tint: UInt8[Tensor, "n 4"] | None = None,
+        signal: Float[Tensor, "n channels"] | None = None,
+    ) -> UInt8[Tensor, "height width 3"]:
+        """`render` in eight bits, a tint mixed into the colours. On the CPU, without a gradient.
+
+        Args:
+            tint: Red, green, blue and how much of them; None is none.
+            signal: Grey (one channel) or colour; None is the colour of the SH.
+        """
+        colours = mixed_colours(
+            self._gaussians,
+            self._camera,
+            tint=tint,
+            signal=signal,
+            degree=self._options.sh_degree,
+        )
+        return eight_bits(self.render(colours).image)
 
     def part_sums(self, parts: Sequence[Int32[Tensor, "pixels"]]) -> list[Any]:
         """Rows of W summed over the parts of each partition: sparse (parts, Gaussians)."""
@@ -331,6 +344,31 @@ def check_columns(name: str, tensor: Tensor, shape: tuple[int | None, ...]) -> N
     if not tensor.is_floating_point():
         raise InputError(f"{name}: expected floating-point values, got {tensor.dtype}.")
     check_finite(name, tensor)
+
+
+def check_picture(
+    count: int,
+    *,
+    tint: Tensor | None,
+    signal: Tensor | None,
+    shown: Tensor | None,
+) -> None:
+    """What a picture is asked of: rows, channels and types.
+
+    Raises:
+        ShapeError: If there is not one row a Gaussian, or another number of columns.
+        InputError: If the tint is not in eight bits, or `shown` not boolean.
+    """
+    if signal is not None:
+        check_columns("signal", signal, (count, 1 if signal.shape[-1] == 1 else 3))
+    if tint is not None:
+        check_shape("tint", tint, (count, 4))
+        if tint.dtype != torch.uint8:
+            raise InputError(f"tint: expected eight bits (uint8), got {tint.dtype}.")
+    if shown is not None:
+        check_shape("shown", shown, (count,))
+        if shown.dtype != torch.bool:
+            raise InputError(f"shown: expected true and false, got {shown.dtype}.")
 
 
 def check_pixels(pixels: Tensor, camera: Camera) -> None:

@@ -10,11 +10,8 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from splatseg._check import check_shape
 from splatseg.core import Camera, Gaussians
 from splatseg.core.sh import evaluate_sh
-from splatseg.errors import InputError
-from splatseg.render._backend import check_columns
 
 _LEVELS = 255
 
@@ -51,31 +48,6 @@ def mixed_colours(
 def eight_bits(image: Float[Tensor, "height width 3"]) -> UInt8[Tensor, "height width 3"]:
     """Colours from 0 to 1 as levels. On the CPU."""
     return (image.clamp(0, 1) * _LEVELS).round().to(torch.uint8).cpu()
-
-
-def check_picture(
-    count: int,
-    *,
-    tint: Tensor | None,
-    signal: Tensor | None,
-    shown: Tensor | None,
-) -> None:
-    """What a picture is asked of: rows, channels and types.
-
-    Raises:
-        ShapeError: If there is not one row a Gaussian, or another number of columns.
-        InputError: If the tint is not in eight bits, or `shown` not boolean.
-    """
-    if signal is not None:
-        check_columns("signal", signal, (count, 1 if signal.shape[-1] == 1 else 3))
-    if tint is not None:
-        check_shape("tint", tint, (count, 4))
-        if tint.dtype != torch.uint8:
-            raise InputError(f"tint: expected eight bits (uint8), got {tint.dtype}.")
-    if shown is not None:
-        check_shape("shown", shown, (count,))
-        if shown.dtype != torch.bool:
-            raise InputError(f"shown: expected true and false, got {shown.dtype}.")
 
 
 def without_hidden(gaussians: Gaussians, shown: Bool[Tensor, "n"]) -> Gaussians:

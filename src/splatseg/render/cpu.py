@@ -55,9 +55,8 @@ class CpuView(BackendView):
     """
 
     def __init__(self, gaussians: Gaussians, camera: Camera, options: RenderOptions) -> None:
-        self._gaussians, self._camera, self._options = gaussians, camera, options
+        super().__init__(gaussians, camera, options)
         self._view: _native.View | None = None
-        self._closed = False
         self._forward: tuple[Tensor, Tensor, Tensor] | None = None
         self._wide: Tensor | None = None
         self._has_harmonics = False
@@ -71,11 +70,6 @@ class CpuView(BackendView):
     def __del__(self) -> None:
         if hasattr(self, "_closed"):
             self.close()
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Height and width."""
-        return self._camera.height, self._camera.width
 
     @property
     def statistics(self) -> dict[str, int]:

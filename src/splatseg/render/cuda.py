@@ -8,14 +8,13 @@ from types import ModuleType
 from typing import Any, ClassVar
 
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from splatseg.core import Camera, Gaussians
 from splatseg.core.sh import evaluate_sh
 from splatseg.errors import BackendError, InputError, MissingPackageError
 from splatseg.render._backend import Backend, BackendView, needs_graph
-from splatseg.render._picture import eight_bits, mixed_colours
 from splatseg.render._rows import SparseWeights
 from splatseg.render._values import (
     ALPHA_MIN,
@@ -269,17 +268,11 @@ class CudaBackendView(BackendView):
         gsplat: ModuleType | Any,
         device: torch.device,
     ) -> None:
-        self._gaussians, self._camera, self._options = gaussians, camera, options
+        super().__init__(gaussians, camera, options)
         self._gsplat: Any = gsplat
         self._device = device
         self._kept: tuple[Gaussians, CudaView] | None = None
         self._median: Tensor | None = None
-        self._closed = False
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Height and width."""
-        return self._camera.height, self._camera.width
 
     def close(self) -> None:
         """Free the GPU's memory."""
@@ -313,23 +306,6 @@ class CudaBackendView(BackendView):
             depth=depth.to(device=home, dtype=dtype),
             median_depth=median.to(device=home, dtype=dtype),
         )
-
-    @torch.no_grad()
-    def picture(
-        self,
-        *,
-        tint: UInt8[Tensor, "n 4"] | None = None,
-        signal: Float[Tensor, "n channels"] | None = None,
-    ) -> UInt8[Tensor, "height width 3"]:
-        """`render` in eight bits, a tint mixed into the colours. On the CPU."""
-        colours = mixed_colours(
-            self._gaussians,
-            self._camera,
-            tint=tint,
-            signal=signal,
-            degree=self._options.sh_degree,
-        )
-        return eight_bits(self.render(colours).image)
 
     @torch.no_grad()
     def back_project(self, image: Float[Tensor, "height width channels"]) -> BackProjected:

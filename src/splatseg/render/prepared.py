@@ -21,13 +21,14 @@ from splatseg.render._backend import (
     BackendView,
     check_columns,
     check_k,
+    check_picture,
     check_pixels,
     check_scene,
     check_table,
     get_backend,
     options_for,
 )
-from splatseg.render._picture import check_picture, eight_bits, mixed_colours, without_hidden
+from splatseg.render._picture import eight_bits, mixed_colours, without_hidden
 from splatseg.render._rows import SparseWeights
 from splatseg.render._values import (
     BackProjected,

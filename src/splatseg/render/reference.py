@@ -4,14 +4,13 @@ from dataclasses import replace
 from typing import ClassVar
 
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from splatseg.core import Camera, Gaussians
 from splatseg.core.sh import evaluate_sh
 from splatseg.errors import InputError
 from splatseg.render._backend import Backend, BackendView, needs_graph
-from splatseg.render._picture import eight_bits, mixed_colours
 from splatseg.render._rows import SparseWeights
 from splatseg.render._values import BackProjected, Contributors, Rendered, RenderOptions
 from splatseg.render.blending import (
@@ -44,14 +43,8 @@ class ReferenceView(BackendView):
     """One view, spelt out."""
 
     def __init__(self, gaussians: Gaussians, camera: Camera, options: RenderOptions) -> None:
-        self._gaussians, self._camera, self._options = gaussians, camera, options
+        super().__init__(gaussians, camera, options)
         self._projected: Projected | None = None
-        self._closed = False
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Height and width."""
-        return self._camera.height, self._camera.width
 
     def close(self) -> None:
         """Forget the projection."""
@@ -112,23 +105,6 @@ class ReferenceView(BackendView):
             depth=depth.to(dtype),
             median_depth=median.to(dtype),
         )
-
-    @torch.no_grad()
-    def picture(
-        self,
-        *,
-        tint: UInt8[Tensor, "n 4"] | None = None,
-        signal: Float[Tensor, "n channels"] | None = None,
-    ) -> UInt8[Tensor, "height width 3"]:
-        """`render` in eight bits, a tint mixed into the colours. On the CPU."""
-        colours = mixed_colours(
-            self._gaussians,
-            self._camera,
-            tint=tint,
-            signal=signal,
-            degree=self._options.sh_degree,
-        )
-        return eight_bits(self.render(colours).image)
 
     @torch.no_grad()
     def back_project(self, image: Float[Tensor, "height width channels"]) -> BackProjected:

@@ -6,12 +6,11 @@ from dataclasses import dataclass, field, replace
 from typing import Self
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from splatseg.core import (
     JSON,
-    Gaussians,
     Layer,
     LayerInfo,
     MaskSet,
@@ -36,6 +35,7 @@ from splatseg.prompting.pipeline import (
 from splatseg.prompting.prompts import (
     AxisBox,
     Ball,
+    Balls,
     Lasso,
     SelectionPrompt,
     Similar,
@@ -188,7 +188,8 @@ class SelectionSession:
             seconds["prompter"] = time.perf_counter() - began
         shown = [prompt for prompt in given if isinstance(prompt, ViewPrompt)]
         similar = [prompt for prompt in given if isinstance(prompt, Similar)]
-        solids = [prompt for prompt in given if isinstance(prompt, AxisBox | Ball | Lasso)]
+        solids = [prompt for prompt in given if isinstance(prompt, Solid)]
+        places = [self._views.inside(solid) for solid in solids]
         if shown or similar:
             began = time.perf_counter()
             self.source  # noqa: B018  (opens it)
@@ -196,11 +197,11 @@ class SelectionSession:
         context = self._seen(shown, options, seconds)
         confidence = self._membership(context, similar, seconds)
         if draft is not None:
-            draft(within(confidence, solids, self._work.gaussians))
+            draft(within(confidence, places))
         if shown or similar:
             confidence, steps = postprocess(confidence, context, enabled=self._steps(options))
             seconds |= steps
-        confidence = within(confidence, solids, self._work.gaussians)
+        confidence = within(confidence, places)
         selection = self._described(confidence, requested, base, options)
         hint = None
         if advise and shown and selection.confidence is not None:
@@ -379,8 +380,8 @@ def select(
     """The Gaussians that prompts mean.
 
     Prompts in views, and `Similar` ones, are answered by a source: masks, features, or a layer of
-    the scene. `AxisBox`, `Ball` and `Lasso` bound the answer: of several, all hold. Alone, they
-    select all that is inside.
+    the scene. `AxisBox`, `Ball`, `Balls` and `Lasso` bound the answer: of several, all hold.
+    Alone, they select all that is inside.
 
     What the command ``splatseg select`` does. `open_selector` is for more than one selection.
 
@@ -420,7 +421,7 @@ def select(
 def _as_prompts(
     prompts: SelectionPrompt | Sequence[SelectionPrompt],
 ) -> tuple[SelectionPrompt, ...]:
-    one = isinstance(prompts, ViewPrompt | AxisBox | Ball | Lasso | Similar)
+    one = isinstance(prompts, SelectionPrompt)
     given = (prompts,) if one else tuple(prompts)
     if not given:
         raise InputError("prompts: expected at least one, got none.")
@@ -462,11 +463,12 @@ def check_base(scene: Scene, base: Selection | None, options: SelectOptions) -> 
         )
 
 
-def within(confidence: Tensor, solids: Sequence[Solid], gaussians: Gaussians) -> Float[Tensor, "n"]:
+def within(
+    confidence: Float[Tensor, "n"], places: Sequence[Bool[Tensor, "n"]]
+) -> Float[Tensor, "n"]:
     """Confidences inside all places, 0 outside."""
-    for solid in solids:
-        inside = solid.contains(gaussians).to(confidence.device)
-        confidence = torch.where(inside, confidence, 0.0)
+    for inside in places:
+        confidence = torch.where(inside.to(confidence.device), confidence, 0.0)
     return confidence
 
 
@@ -537,6 +539,9 @@ def prompt_record(prompt: SelectionPrompt) -> dict[str, JSON]:
             return {"kind": "box", "low": list(prompt.low), "high": list(prompt.high)}
         case Ball():
             return {"kind": "sphere", "centre": list(prompt.centre), "radius": prompt.radius}
+        case Balls():
+            middles: list[JSON] = [[float(v) for v in one] for one in prompt.centres.tolist()]
+            return {"kind": "spheres", "centres": middles, "radius": prompt.radius}
         case Lasso():
             corners: list[JSON] = [[float(v) for v in corner] for corner in prompt.polygon.tolist()]
             return {"kind": "lasso", "view": prompt.view.name, "polygon": corners}

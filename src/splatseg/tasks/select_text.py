@@ -128,7 +128,7 @@ def select_text(
     seconds |= made.seconds
     found = selection_of(made, session, asked)
     confidence, steps = _cleaned(work, made.confidence, chosen)
-    confidence = within(confidence, places, scene.gaussians)
+    confidence = within(confidence, [place.contains(scene.gaussians) for place in places])
     selection = combined(Selection.of_confidence(confidence), base, chosen.mode)
     evidence = None if features is None else features.folder.name
     return Selected(

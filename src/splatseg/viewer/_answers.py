@@ -1,12 +1,11 @@
 """What the worker does for a page: pictures, selections, commands, jobs; on one `Session`."""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
-import msgspec
 import numpy as np
 
 from splatseg.core import UNLABELLED, Features, Labels, Scene, Selection
@@ -15,21 +14,9 @@ from splatseg.render import BackendName
 from splatseg.tasks.work import EXPORTS_FOLDER
 from splatseg.viewer import _jobs as jobs
 from splatseg.viewer import _messages as messages
-from splatseg.viewer._document import (
-    COMMANDS,
-    MEMBER,
-    Apply,
-    Confidence,
-    Document,
-    Edit,
-    Isolate,
-    Join,
-    Keep,
-    Mask,
-    Refine,
-    Select,
-    Subtract,
-)
+from splatseg.viewer._client import Client, Job
+from splatseg.viewer._commands import command_of, confidence_of, edit_of
+from splatseg.viewer._document import MEMBER, Confidence, Document, Edit, Mask, Select
 from splatseg.viewer._draw import Drawer, Pace
 from splatseg.viewer._mirror import Mirror, scene_info, view_infos
 from splatseg.viewer._pictures import Pictures
@@ -37,7 +24,9 @@ from splatseg.viewer._prompts import prompts_of
 from splatseg.viewer._selecting import bytes_of
 from splatseg.viewer._session import Session, open_session
 from splatseg.viewer._shaping import combined
-from splatseg.viewer._worker import Client, Job, Worker
+from splatseg.viewer._streams import Streams
+from splatseg.viewer._tint import RAMP_STOPS
+from splatseg.viewer._worker import Worker
 
 T = TypeVar("T")
 
@@ -57,6 +46,9 @@ class _Memory:
     words: str = ""
     """What was last searched for: similarity is to this."""
 
+    legend: messages.Legend | None = None
+    """What it was told last of the colours."""
+
 
 class SceneAnswers:
     """Answers about one scene.
@@ -69,6 +61,7 @@ class SceneAnswers:
         name: What the page calls the scene.
         backend: Rendering backend, for jobs.
         fitting: How far its fit is, where it is not finished.
+        stage: Who draws while the camera moves, unless a page chooses otherwise.
     """
 
     def __init__(
@@ -81,21 +74,24 @@ class SceneAnswers:
         name: str,
         backend: BackendName = "auto",
         fitting: messages.FittingInfo | None = None,
+        stage: messages.Drawing = "server",
     ) -> None:
         self._session = session
         self._drawer = drawer
         self._worker = worker
         self._fitting = fitting
+        self._stage: messages.Drawing = stage
         self._ready = False
         self._features: dict[str, bool] = {}
         self._cleaning = float("inf")
         """Seconds that a Gaussian of the last selection took from its draft on."""
         self._drawing = 0.0
         """Seconds of the last picture at rest."""
-        self._mirror = Mirror(session.scene, session.confidence)
+        self._mirror = Mirror(session.confidence, lambda: session.shown.centres)
         self._scene_info = scene_info(session.scene, name)
         self._views = view_infos(session.scene)
         self._pictures = Pictures(session, drawer)
+        self._streams = Streams(session)
         self._jobs = jobs.SceneJobs(
             session,
             pictures=self._pictures,
@@ -120,8 +116,10 @@ class SceneAnswers:
 
     def close(self) -> None:
         """Save and release."""
+        self._jobs.close()
         self._session.close()
         self._pictures.close()
+        self._streams.close()
         self._drawer.close()
 
     def prepare(self) -> None:
@@ -133,6 +131,7 @@ class SceneAnswers:
     def join(self, client: Client) -> None:
         """Send a page all that it shows."""
         client.send(self.state(client))
+        self._streams.tell(client)
 
     def state(self, client: Client) -> messages.State:
         """All that a page shows."""
@@ -145,13 +144,15 @@ class SceneAnswers:
             words=_or(False, lambda: session.words),  # noqa: FBT003
             modes=self._modes(),
             features=list(messages.FEATURES),
+            ramp=list(RAMP_STOPS),
             document=self._mirror.document(session.document),
-            undo=session.undo_label,
-            redo=session.redo_label,
+            undo=session.history.undo_label,
+            redo=session.history.redo_label,
             clients=len(self._worker.clients),
             me=client.id,
             ready=self._ready,
             fitting=self._fitting,
+            stage=self._stage,
         )
 
     def _modes(self) -> list[str]:
@@ -166,18 +167,23 @@ class SceneAnswers:
         """A photograph as JPEG."""
         return self._drawer.photograph(name, width)
 
+    def gaussians(self, version: int) -> Path:
+        """A PLY file of the Gaussians that are drawn, for a page that draws them itself."""
+        return self._streams.file(version)
+
     def _changed(self, old: Document, new: Document, author: str) -> None:
         """Tell all pages of a change, and draw it."""
+        # First: what a page asks for once it knows of the change is meant as it is.
+        self._worker.redraw(author)
+        history = self._session.history
         self._worker.broadcast(
             self._mirror.patch(
-                old,
-                new,
-                undo=self._session.undo_label,
-                redo=self._session.redo_label,
-                author=author,
+                old, new, undo=history.undo_label, redo=history.redo_label, author=author
             )
         )
-        self._worker.redraw(author)
+        for client in self._worker.clients:
+            if client.welcomed:
+                self._streams.tell(client)
 
     # Pictures.
 
@@ -198,6 +204,7 @@ class SceneAnswers:
             request.camera(),
             selection=selection,
             words=_memory(client).words,
+            preview=self._preview(request),
             scale=scale,
         )
         if request.rest:
@@ -216,6 +223,20 @@ class SceneAnswers:
                 rest=request.rest,
             )
         )
+        legend = messages.Legend(mode=request.mode, ends=picture.ends)
+        if request.rest and legend != _memory(client).legend:
+            _memory(client).legend = legend
+            client.send(legend)
+
+    def _preview(self, request: messages.DrawRequest) -> Edit | None:
+        """The move under way; None where what moves is not there any more.
+
+        It is only looked at: the command that ends it says what is wrong.
+        """
+        if request.preview is None:
+            return None
+        given, session = request.preview, self._session
+        return _or(None, lambda: edit_of("move", given, session, centre=self._mirror.middle))
 
     # Messages.
 
@@ -226,6 +247,10 @@ class SceneAnswers:
                 self._select(client, message)
             case messages.CommandRequest():
                 self._command(client, message)
+            case messages.StageRequest():
+                client.stage = message.stage
+                client.data.pop("streams", None)
+                self._streams.tell(client)
             case messages.Undo():
                 _memory(client).gesture = None
                 self._session.undo(author=client.author)
@@ -233,7 +258,8 @@ class SceneAnswers:
                 _memory(client).gesture = None
                 self._session.redo(author=client.author)
             case messages.DepthRequest():
-                found = self._pictures.drawer.depth(message.camera.camera(), message.x, message.y)
+                place = [(message.x, message.y)]
+                (found,) = self._pictures.surface(message.camera.camera(), place)
                 point = None if found is None else [float(value) for value in found]
                 client.send(messages.PointAnswer(gesture=message.gesture, point=point))
             case messages.Hello():
@@ -310,7 +336,12 @@ class SceneAnswers:
                 memory.words = words or memory.words
                 session.select(
                     words
-                    or prompts_of(request, session.scene, self._pictures.drawer, session.selected),
+                    or prompts_of(
+                        request,
+                        session.scene,
+                        surface=self._pictures.surface,
+                        selection=session.selected,
+                    ),
                     mode=request.mode,
                     level=request.level,
                     base=memory.base,
@@ -344,9 +375,9 @@ class SceneAnswers:
     ) -> None:
         """Select a mask, or change the selection by it."""
         base = None if memory.base is None else self._session.confidence(memory.base)
-        mask = self._session.masks.put(combined(confidence, base, request.mode))
         kind = request.kind if isinstance(request, messages.SelectRequest) else "object"
-        self._session.do(Select(mask, {"kind": kind}), author=client.author)
+        values = combined(confidence, base, request.mode)
+        self._session.select_values(values, {"kind": kind}, author=client.author)
 
     def _send_selected(
         self,
@@ -376,79 +407,14 @@ class SceneAnswers:
         given = messages.arguments(request)
         session, memory = self._session, _memory(client)
         memory.gesture = None
-        match given:
-            case messages.SelectObject() | messages.SelectSuggestion():
-                memory.base = session.document.selection
-                self._select_mask(client, given, memory, self._confidence_of(given))
-                return
-            case messages.Split():
-                session.split(given.id, by=given.by, plane=given.plane, author=client.author)
-                return
-            case messages.EditOf():
-                command: Any = Apply(self._edit(request.name, given))
-            case messages.Keep():
-                command = Keep(given.name, given.class_name, given.colour)
-            case messages.Isolate():
-                command = Isolate(tuple(given.ids))
-            case messages.Join():
-                command = Join(tuple(given.ids), given.name)
-            case messages.OfId() if request.name in ("subtract", "refine"):
-                kind = Subtract if request.name == "subtract" else Refine
-                command = kind(given.id, self._selected_mask(request.name))
-            case _:
-                fields = msgspec.structs.asdict(given)
-                if "ids" in fields:
-                    fields["ids"] = tuple(fields["ids"])
-                command = COMMANDS[request.name](**fields)
-        session.do(command, author=client.author, revision=request.revision)
-
-    def _selected_mask(self, what: str) -> Mask:
-        mask = self._session.document.selection
-        if mask is None:
-            raise InputError(f"{what}: expected a selection, got none; click first.")
-        return mask
-
-    def _confidence_of(
-        self, given: messages.SelectObject | messages.SelectSuggestion
-    ) -> Confidence:
-        """The confidences of objects, or of a suggestion."""
-        session, document = self._session, self._session.document
-        if isinstance(given, messages.SelectSuggestion):
-            found = [one.mask for one in document.suggestions if one.id == given.id]
-            if not found:
-                raise InputError(f"suggestion: expected one of those there are, got {given.id}.")
-            return session.confidence(found[0])
-        ids = given.ids or ([] if given.id is None else [given.id])
-        return self._union([document.object(id).mask for id in ids])
-
-    def _union(self, masks: Sequence[Mask]) -> Confidence:
-        found = np.zeros(len(self._session.scene.gaussians), dtype=np.uint8)
-        for mask in masks:
-            found = np.maximum(found, self._session.confidence(mask))
-        return found
-
-    def _edit(self, kind: str, given: messages.EditOf) -> Edit:
-        """An edit of objects, or of the selection."""
-        document = self._session.document
-        if given.ids is None:
-            mask = self._selected_mask(kind)
+        if isinstance(given, messages.SelectObject | messages.SelectSuggestion):
+            memory.base = session.document.selection
+            self._select_mask(client, given, memory, confidence_of(given, session))
+        elif isinstance(given, messages.Split):
+            session.split(given.id, by=given.by, plane=given.plane, author=client.author)
         else:
-            mask = self._session.masks.put(
-                self._union([document.object(id).mask for id in given.ids])
-            )
-        if isinstance(given, messages.Recolour):
-            return Edit(kind="recolour", mask=mask, colour=given.colour)
-        if not isinstance(given, messages.Move):
-            return Edit(kind="remove", mask=mask)
-        about = given.about
-        return Edit(
-            kind="duplicate" if kind == "duplicate" else "move",
-            mask=mask,
-            rotation=given.rotation,
-            translation=given.translation,
-            scale=given.scale,
-            about=self._mirror.centre(mask)[0] if about is None else about,
-        )
+            command = command_of(request.name, given, session, centre=self._mirror.middle)
+            session.do(command, author=client.author, revision=request.revision)
 
     # Jobs.
 
@@ -479,7 +445,11 @@ def _milliseconds(began: float) -> float:
 
 
 def opener(
-    scene: Scene | Path, *, layer: str | None = None, backend: BackendName = "auto"
+    scene: Scene | Path,
+    *,
+    layer: str | None = None,
+    backend: BackendName = "auto",
+    stage: messages.Drawing = "server",
 ) -> Callable[[Worker], SceneAnswers]:
     """What opens a scene in the worker's thread.
 
@@ -487,6 +457,7 @@ def opener(
         scene: The scene, or its folder.
         layer: A layer whose objects are suggested at once.
         backend: Rendering backend.
+        stage: Who draws while the camera moves, unless a page chooses otherwise.
     """
 
     def opened(worker: Worker) -> SceneAnswers:
@@ -503,6 +474,7 @@ def opener(
                 relay=relay,
                 name="scene" if root is None else root.resolve().name,
                 backend=backend,
+                stage=stage,
             )
         except BaseException:
             session.close()

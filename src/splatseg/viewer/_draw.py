@@ -1,6 +1,5 @@
-"""Pictures of a camera in every mode, id maps, depth of a pixel, photographs."""
+"""Pictures of a camera in every mode, id maps, the surface under pixels, photographs."""
 
-import math
 import time
 from collections import OrderedDict
 from collections.abc import Sequence
@@ -27,6 +26,7 @@ from splatseg.viewer._tint import (
     owner_tint,
     owners_of,
     ramp_tint,
+    range_of,
     selected_share,
     selected_tint,
     stretched,
@@ -52,6 +52,9 @@ class Picture:
 
     rgb: NDArray[np.uint8]
     seconds: float
+    ends: tuple[float, float] | None = None
+    """Values at the dark blue and at the yellow end of the ramp: z-depth in scene units, else
+    shares of 1; None where no value is drawn."""
 
 
 class Drawer:
@@ -132,16 +135,22 @@ class Drawer:
         for mask, _ in objects:
             self._check("objects", mask, np.uint8, np.bool_)
         view = self._prepared(scaled(camera, scale), shown, share=scale == 1)
+        ends = None
         if mode == "objects":
             rgb = self._with_selection(view, self._drawn_objects(view, objects), selection)
         elif mode == "depth":
-            rgb = self._with_selection(view, _drawn_depth(view), selection)
+            rgb, ends = _drawn_depth(view)
+            rgb = self._with_selection(view, rgb, selection)
         else:
+            if mode == "confidence":
+                ends = (0.0, 1.0)
+            elif mode == "similarity" and similarity is not None:
+                ends = range_of(similarity)
             tint = self._tint(mode, selection, objects, similarity)
             if selection is not None and mode != "confidence":
                 tint = selected_tint(selection, tint)
             rgb = view.picture(None if tint is None else torch.from_numpy(tint)).numpy()
-        return Picture(rgb=rgb, seconds=time.perf_counter() - began)
+        return Picture(rgb=rgb, seconds=time.perf_counter() - began, ends=ends)
 
     def jpeg(self, picture: Picture, quality: int) -> bytes:
         """The picture as JPEG.
@@ -184,48 +193,60 @@ class Drawer:
         found = self._prepared(camera, shown).argmax(signal, background=background)
         return found.channels.numpy().astype(np.uint16)
 
-    def depth(
-        self, camera: Camera, x: float, y: float, *, shown: NDArray[np.bool_] | None = None
-    ) -> NDArray[np.float64] | None:
-        """The point of the scene under a pixel, (3,), scene units; None where there is nothing.
+    def surface(
+        self,
+        camera: Camera,
+        points: Sequence[tuple[float, float]],
+        *,
+        shown: NDArray[np.bool_] | None = None,
+    ) -> list[NDArray[np.float64] | None]:
+        """The points of the scene under pixels, each (3,), scene units; None where nothing is.
 
-        Its depth is the pixel's median depth: that of the Gaussian with which half of the light
+        Their depth is the pixels' median depth: that of the Gaussian with which half of the light
         is stopped.
 
         Args:
             camera: The camera.
-            x: Pixels from the left edge.
-            y: Pixels from the upper edge.
+            points: Pixels from the left and from the upper edge.
             shown: False where a Gaussian is left out, (n,).
         """
         self._check("shown", shown, np.bool_)
-        if not (0 <= x < camera.width and 0 <= y < camera.height):
-            return None
-        pixel = torch.tensor([[math.floor(x), math.floor(y)]])
-        found = int(self._prepared(camera, shown).contributors(pixel, 1).median[0])
-        if found < 0:
-            return None
+        found: list[NDArray[np.float64] | None] = [None] * len(points)
+        inside = [
+            i for i, (x, y) in enumerate(points) if 0 <= x < camera.width and 0 <= y < camera.height
+        ]
+        if not inside:
+            return found
+        chosen = torch.tensor([points[i] for i in inside], dtype=torch.float64)
+        medians = self._prepared(camera, shown).contributors(chosen.floor().long(), 1).median
         pose = camera.cam_from_world
-        mean = self._scene.gaussians.means[found].to(pose)
-        depth = pose[2, :3] @ mean + pose[2, 3]
-        return camera.unproject(torch.tensor([x, y], dtype=torch.float64), depth).numpy()
+        for i, point, row in zip(inside, chosen, medians.tolist(), strict=True):
+            if row >= 0:
+                mean = self._scene.gaussians.means[row].to(pose)
+                found[i] = camera.unproject(point, pose[2, :3] @ mean + pose[2, 3]).numpy()
+        return found
 
     def photograph(self, name: str, width: int) -> bytes:
-        """The photograph of a view as JPEG; some of them are kept.
+        """The photograph of a view as JPEG, its render where it has none; some of them are kept.
 
         Args:
             name: The view.
             width: Pixels across at most, 16 to 2048.
 
         Raises:
-            InputError: If there is no such view, or it has no photograph.
+            InputError: If there is no such view, or its photograph is gone.
         """
         width = min(max(width, _SMALLEST), _WIDEST)
         key = (name, width)
         if key not in self._photographs:
             view = self._scene.view(name)
-            longest = max(width, round(width * view.camera.height / view.camera.width))
-            image = view.read_image(longest=longest)
+            height = max(1, round(width * view.camera.height / view.camera.width))
+            if view.image is None:
+                camera = view.camera.resized(width, height)
+                with prepare(self._scene.gaussians, camera, backend=self._backend) as drawn:
+                    image = drawn.picture()
+            else:
+                image = view.read_image(longest=max(width, height))
             self._photographs[key] = _jpeg(image.numpy(), _PHOTOGRAPH_QUALITY)
             while len(self._photographs) > 1 and self._photograph_bytes > _PHOTOGRAPHS:
                 self._photographs.popitem(last=False)
@@ -319,16 +340,20 @@ class Drawer:
         return np.round(rgb + (np.array(SELECTED, np.float32) - rgb) * share).astype(np.uint8)
 
 
-def _drawn_depth(view: PreparedView) -> NDArray[np.uint8]:
-    """Expected depth, near yellow, far blue, black where less than half of the light is stopped."""
+def _drawn_depth(view: PreparedView) -> tuple[NDArray[np.uint8], tuple[float, float] | None]:
+    """Expected depth, near yellow, far blue, black where less than half of the light is stopped.
+
+    With the depths that are blue and yellow; None where nothing is seen.
+    """
     drawn = view.render()
     depth, covered = drawn.depth.cpu().numpy(), drawn.alpha.cpu().numpy() > _MIN_ALPHA
     rgb = np.zeros((*depth.shape, 3), np.uint8)
-    if covered.any():
-        near, far = np.percentile(depth[covered], (2, 98))
-        along = np.clip((depth[covered] - near) / max(far - near, 1e-9), 0, 1)
-        rgb[covered] = RAMP[np.round(255 * (1 - along)).astype(np.uint8)]
-    return rgb
+    if not covered.any():
+        return rgb, None
+    near, far = (float(value) for value in np.percentile(depth[covered], (2, 98)))
+    along = np.clip((depth[covered] - near) / max(far - near, 1e-9), 0, 1)
+    rgb[covered] = RAMP[np.round(255 * (1 - along)).astype(np.uint8)]
+    return rgb, (far, near)
 
 
 def _components_of(scene: Scene) -> Tint:

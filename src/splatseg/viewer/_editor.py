@@ -38,7 +38,8 @@ class Editor:
         return () if self._journal is None else self._journal.notes
 
     def close(self) -> None:
-        """Give the lock of the journal back."""
+        """Give the lock of the journal back, and forget masks that are in no folder."""
+        self.masks.close()
         if self._journal is not None:
             self._journal.close()
 

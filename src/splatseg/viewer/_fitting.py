@@ -28,14 +28,21 @@ class FittingScene:
         folder: The folder.
         capture: What is fitted, for the cameras of its photographs; None shows no photographs.
         backend: Rendering backend.
+        stage: Who draws while the camera moves, unless a page chooses otherwise.
     """
 
     def __init__(
-        self, folder: Path, *, capture: Capture | None = None, backend: BackendName = "auto"
+        self,
+        folder: Path,
+        *,
+        capture: Capture | None = None,
+        backend: BackendName = "auto",
+        stage: messages.Drawing = "server",
     ) -> None:
         self._folder = folder
         self._capture = capture
         self._backend: BackendName = backend
+        self._stage: messages.Drawing = stage
 
     @property
     def mark(self) -> object:
@@ -55,7 +62,7 @@ class FittingScene:
             InputError: If there is no checkpoint yet.
         """
         if is_scene(self._folder):
-            return opener(self._folder, backend=self._backend)(worker)
+            return opener(self._folder, backend=self._backend, stage=self._stage)(worker)
         path = self._folder / CHECKPOINT_FILE
         try:
             summary, gaussians = checkpoint_summary(path), checkpoint_gaussians(path)
@@ -76,6 +83,7 @@ class FittingScene:
             name=self._folder.resolve().name,
             backend=self._backend,
             fitting=messages.FittingInfo(steps=summary.steps, progress=summary.progress),
+            stage=self._stage,
         )
 
 

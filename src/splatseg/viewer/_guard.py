@@ -32,6 +32,8 @@ MAX_REFUSED = 200
 """So many messages that are refused in a minute end the connection."""
 
 LOGINS_A_MINUTE = 30
+GAUSSIANS_A_MINUTE = 60
+"""Most files of Gaussians that all pages together fetch; each may have hundreds of MB."""
 
 _LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
 _OPEN = ("/", "/login")

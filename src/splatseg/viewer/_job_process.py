@@ -5,24 +5,36 @@ standard input and writes lines of JSON: ``{"done", "total", "text"}``, and at t
 or ``{"error"}``. A process that is ended has written whole views.
 """
 
+import contextlib
+import itertools
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 import msgspec
 from typing_extensions import override
 
-from splatseg.errors import InputError, SplatsegError
+from splatseg.errors import InputError, MissingFileError, MissingPackageError, SplatsegError
 from splatseg.render import BackendName
-from splatseg.tasks.work import Observer
+from splatseg.report.words import counted
+from splatseg.tasks.work import Observer, Work
+
+if TYPE_CHECKING:
+    from splatseg.core.models import Model
 
 _SECONDS = 0.2
 """Between two lines of one stage."""
 
 EVIDENCE = "masks"
-"""Name of the evidence that is written and read."""
+"""Name of the evidence that is written."""
+
+_WITH_WEIGHTS = ("sam2", "sam-hq", "sam")
+"""Models of masks that are taken where there is a GPU and their weights are on this machine, the
+best first; on a CPU each view would take minutes."""
+
+_METHOD = "associate"
 
 
 class _Lines(Observer):
@@ -53,35 +65,88 @@ def _say(out: TextIO, value: dict[str, Any]) -> None:
     out.flush()
 
 
+def masks_at_hand(work: Work) -> str | None:
+    """The evidence of masks that covers all views to learn from; of several, one of SAM first."""
+    wanted = {view.name for view in work.scene.train_views or work.scene.views}
+    names: list[str] = []
+    for name in work.evidence_names:
+        # What a `see` that was stopped has left cannot be opened; the same `see` goes on with it.
+        with contextlib.suppress(InputError):
+            evidence = work.evidence(name)
+            if evidence.kind == "masks" and wanted <= set(evidence.view_names):
+                names.append(name)
+    return min(names, key=lambda name: ("sam" not in name, name), default=None)
+
+
+def _model_at_hand() -> "Model | str":
+    import torch
+
+    from splatseg.models import find_model
+
+    if torch.cuda.is_available():
+        for name in _WITH_WEIGHTS:
+            with contextlib.suppress(MissingFileError, MissingPackageError):
+                return find_model(name)
+    return "classical"
+
+
 def _see(root: Path, given: dict[str, Any], backend: BackendName, observer: Observer) -> str:
     from splatseg.io.scene import load_scene
     from splatseg.models import model_names
     from splatseg.tasks import SeeOptions, see
 
-    model = given.get("model", "classical")
-    if model not in model_names():
+    scene, model = load_scene(root), given.get("model")
+    if model is None:
+        there = masks_at_hand(Work(scene=scene, backend=backend))
+        if there is not None:
+            return f"{there} are at hand"
+        model = _model_at_hand()
+    elif model not in model_names():
         raise InputError(f"model: expected one of {', '.join(model_names())}, got {model!r:.60}.")
+    views = ("train",) if scene.train_views else ("all",)
     seen = see(
-        load_scene(root), model, EVIDENCE, options=SeeOptions(), backend=backend, observer=observer
+        scene,
+        model,
+        EVIDENCE,
+        options=SeeOptions(views=views),
+        backend=backend,
+        observer=observer,
     )
-    return f"{seen.kind} of {seen.views} views by {seen.model}"
+    return f"{seen.kind} of {counted(seen.views, 'view')} by {seen.model}"
 
 
 def _associate(root: Path, given: dict[str, Any], backend: BackendName, observer: Observer) -> str:
+    from splatseg.core import UNLABELLED, InstanceTree, Labels
     from splatseg.io.scene import load_scene
     from splatseg.io.scene_folder import work_on_scene
     from splatseg.tasks import SegmentOptions, save_segmentation, segment
 
     with work_on_scene(root, "segment", writes=("layers",)):
+        scene = load_scene(root)
+        work = Work(scene=scene, backend=backend)
+        evidence = masks_at_hand(work) or EVIDENCE
         found = segment(
-            load_scene(root),
-            "associate",
-            options=SegmentOptions(evidence=EVIDENCE),
+            scene,
+            _METHOD,
+            options=SegmentOptions(
+                evidence=evidence,
+                layer=_free_name(work, evidence),
+                views=("train",) if scene.train_views else ("all",),
+            ),
             backend=backend,
             observer=observer,
         )
         save_segmentation(found, root)
-    return f"layer {found.name}"
+    layer = found.layer.cut() if isinstance(found.layer, InstanceTree) else found.layer
+    ids = set(layer.ids.tolist()) if isinstance(layer, Labels) else set[int]()
+    return f"{counted(len(ids - {UNLABELLED}), 'object')} in layer {found.name}"
+
+
+def _free_name(work: Work, name: str) -> str:
+    """A name for the layer that replaces none but one that was associated, too."""
+    taken = {one for one in work.layer_names if work.facts(one).info.method != _METHOD}
+    numbered = (f"{name}_{number}" for number in itertools.count(2))
+    return next(one for one in itertools.chain((name,), numbered) if one not in taken)
 
 
 _WORK: dict[str, Callable[[Path, dict[str, Any], BackendName, Observer], str]] = {

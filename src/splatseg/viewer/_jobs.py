@@ -27,13 +27,16 @@ from splatseg.io.scene_folder import scene_path
 from splatseg.render import BackendName
 from splatseg.tasks.work import EXPORTS_FOLDER, Observer
 from splatseg.viewer import _messages as messages
+from splatseg.viewer._client import Job
 from splatseg.viewer._mirror import Mirror
 from splatseg.viewer._pictures import Pictures
 from splatseg.viewer._session import Session
-from splatseg.viewer._worker import Job, Worker
+from splatseg.viewer._worker import Worker
 
 _FRAMES_A_SECOND = 24.0
 _POLL_SECONDS = 0.2
+_END_SECONDS = 10.0
+"""What a process that is cancelled may take to end; from half of it on it is killed."""
 
 
 class Relay(Observer):
@@ -144,8 +147,8 @@ def start_process(
     backend: str,
     arguments: Any,
     done: Callable[[messages.Finished | messages.Error], None],
-) -> None:
-    """Begin a job in a process of its own, and return.
+) -> threading.Thread:
+    """Begin a job in a process of its own, and return the thread that follows it.
 
     Args:
         job: The job.
@@ -174,6 +177,7 @@ def start_process(
         daemon=True,
     )
     thread.start()
+    return thread
 
 
 def _followed(
@@ -212,7 +216,7 @@ def _end_if_cancelled(job: Job, process: "subprocess.Popen[str]") -> None:
         if job.cancelled:
             process.terminate()
             with contextlib.suppress(subprocess.TimeoutExpired):
-                process.wait(timeout=10)
+                process.wait(timeout=_END_SECONDS / 2)
                 return
             process.kill()
             return
@@ -251,13 +255,22 @@ class SceneJobs:
         self._relay = relay
         self._backend: BackendName = backend
         self._layers_changed = layers_changed
+        self._following: list[threading.Thread] = []
+
+    def close(self) -> None:
+        """Wait until the processes of jobs, all cancelled, have ended: none outlives the server."""
+        for thread in self._following:
+            thread.join(timeout=_END_SECONDS)
 
     def run(self, job: Job) -> None:
         """Do a job, or begin it in a process of its own."""
         given = messages.arguments(job.request)
         if isinstance(given, messages.See | messages.Associate):
             root = self._session.scene.root
-            start_process(job, root, self._backend, given, lambda end: self._ended(job, end))
+            self._following = [thread for thread in self._following if thread.is_alive()]
+            self._following.append(
+                start_process(job, root, self._backend, given, lambda end: self._ended(job, end))
+            )
             return
         with self._relay.telling(job):
             file, text = self._do(job, given)
@@ -316,6 +329,8 @@ class SceneJobs:
                 self._session.reopen()
                 self._layers_changed()
             self._worker.end_job(job, ending)
+            if isinstance(ending, messages.Finished):
+                self._session.prepare()  # as after opening: the next click is no slower
 
         if self._worker.call(tell).cancelled():
             self._worker.end_job(job, ending)

@@ -21,12 +21,14 @@ from splatseg.io.splats import WritableFormat
 from splatseg.viewer._outgoing import VERSION as VERSION
 from splatseg.viewer._outgoing import Clients as Clients
 from splatseg.viewer._outgoing import DocumentInfo as DocumentInfo
+from splatseg.viewer._outgoing import Drawing as Drawing
 from splatseg.viewer._outgoing import EditInfo as EditInfo
 from splatseg.viewer._outgoing import Error as Error
 from splatseg.viewer._outgoing import Finished as Finished
 from splatseg.viewer._outgoing import FittingInfo as FittingInfo
 from splatseg.viewer._outgoing import HintAnswer as HintAnswer
 from splatseg.viewer._outgoing import HomeInfo as HomeInfo
+from splatseg.viewer._outgoing import Legend as Legend
 from splatseg.viewer._outgoing import ObjectInfo as ObjectInfo
 from splatseg.viewer._outgoing import Outgoing as Outgoing
 from splatseg.viewer._outgoing import Patch as Patch
@@ -40,12 +42,14 @@ from splatseg.viewer._outgoing import Stage as Stage
 from splatseg.viewer._outgoing import State as State
 from splatseg.viewer._outgoing import SuggestionInfo as SuggestionInfo
 from splatseg.viewer._outgoing import ViewInfo as ViewInfo
+from splatseg.viewer._outgoing import codes_bytes as codes_bytes
 from splatseg.viewer._outgoing import error_message as error_message
 from splatseg.viewer._outgoing import form as form
 from splatseg.viewer._outgoing import frame_bytes as frame_bytes
 from splatseg.viewer._outgoing import id_map_bytes as id_map_bytes
+from splatseg.viewer._outgoing import selection_bytes as selection_bytes
 
-FEATURES = ("layer", "coco", "select_suggestion")
+FEATURES = ("layer", "coco", "select_suggestion", "preview")
 """What a server can besides the first form of the protocol."""
 
 MAX_TEXT = 4096
@@ -142,6 +146,14 @@ class Hello(_Incoming, kw_only=True, tag_field="type", tag="hello"):
 
     version: int
     token: Annotated[str, Meta(max_length=200)] | None = None
+    stage: Drawing = "server"
+    """A page that draws is told what each Gaussian belongs to."""
+
+
+class StageRequest(_Incoming, kw_only=True, tag_field="type", tag="stage"):
+    """Another one draws from now on."""
+
+    stage: Drawing
 
 
 class DrawRequest(ViewCamera, kw_only=True, tag_field="type", tag="camera"):
@@ -158,6 +170,9 @@ class DrawRequest(ViewCamera, kw_only=True, tag_field="type", tag="camera"):
     ids: bool = False
     """Whether an id map is to follow the picture at rest."""
 
+    preview: "Move | None" = None
+    """A move under way, which is drawn and changes nothing."""
+
 
 class SelectRequest(_Incoming, kw_only=True, tag_field="type", tag="select"):
     """What a person shows. Pixels are those of `camera`, or of the photograph `view`."""
@@ -173,7 +188,7 @@ class SelectRequest(_Incoming, kw_only=True, tag_field="type", tag="select"):
     """Of a stroke, pixels."""
 
     radius: Annotated[float, Meta(gt=0, le=1e9)] | None = None
-    """Of a sphere, scene units."""
+    """Of the balls of a sphere brush, scene units; `points` are where it went."""
 
     text: Annotated[str, Meta(max_length=200)] = ""
     level: Annotated[float, Meta(ge=0, le=1)] = 0.5
@@ -225,8 +240,8 @@ class Cancel(_Incoming, kw_only=True, tag_field="type", tag="cancel"):
 
 
 Incoming: TypeAlias = (
-    Hello | DrawRequest | SelectRequest | CommandRequest | Undo | Redo | DepthRequest
-    | HintRequest | JobRequest | Cancel
+    Hello | StageRequest | DrawRequest | SelectRequest | CommandRequest | Undo | Redo
+    | DepthRequest | HintRequest | JobRequest | Cancel
 )  # fmt: skip
 
 
@@ -376,9 +391,11 @@ COMMANDS: dict[str, type[_Incoming]] = {
 
 
 class See(_Incoming, kw_only=True):
-    """Masks of the photographs."""
+    """Masks of the views."""
 
-    model: Annotated[str, Meta(pattern=r"\A[a-z0-9][a-z0-9-]{0,39}\Z")] = "classical"
+    model: Annotated[str, Meta(pattern=r"\A[a-z0-9][a-z0-9-]{0,39}\Z")] | None = None
+    """None takes what is at hand: masks that are there, weights on this machine, or ``classical``,
+    which needs none."""
 
 
 class Associate(_Incoming, kw_only=True):

@@ -30,18 +30,24 @@ class Mirror:
     """Describes documents of one scene; what masks extend over is computed once.
 
     Args:
-        scene: The scene.
         confidence: The confidences of a mask, u8 per Gaussian.
+        centres: Where the scene's Gaussians are now, (n, 3), world: the same array while nothing
+            else is moved.
     """
 
-    def __init__(self, scene: Scene, confidence: Callable[[Mask], NDArray[np.uint8]]) -> None:
-        self._scene = scene
+    def __init__(
+        self,
+        confidence: Callable[[Mask], NDArray[np.uint8]],
+        centres: Callable[[], NDArray[np.float32]],
+    ) -> None:
         self._confidence = confidence
-        self._means = scene.gaussians.means.detach().cpu().numpy()
-        self._kept: dict[str, _Extent] = {}
+        self._centres = centres
+        self._means = centres()
+        self._kept: dict[str, tuple[Mask, _Extent]] = {}
 
     def document(self, document: Document) -> messages.DocumentInfo:
         """The whole document."""
+        self._follow_moves()
         return messages.DocumentInfo(
             revision=document.revision,
             objects=[self._object(one) for one in document.objects],
@@ -55,18 +61,24 @@ class Mirror:
         self, old: Document, new: Document, *, undo: str | None, redo: str | None, author: str
     ) -> messages.Patch:
         """What changed from one document to another."""
+        moved = self._follow_moves()
         before = {one.id: one for one in old.objects}
         after = {one.id: one for one in new.objects}
         same_order = list(before) == list(after)
         return messages.Patch(
             from_=old.revision,
             to=new.revision,
-            objects=[self._object(one) for one in new.objects if before.get(one.id) != one],
+            objects=[
+                self._object(one)
+                for one in new.objects
+                if before.get(one.id) != one or one.mask.id in moved
+            ],
             gone=[id for id in before if id not in after],
             order=None if same_order else list(after),
             suggestions=(
                 None
                 if old.suggestions == new.suggestions
+                and not any(one.mask.id in moved for one in new.suggestions)
                 else [self._suggestion(one) for one in new.suggestions]
             ),
             selection=self.selection(new.selection),
@@ -91,10 +103,31 @@ class Mirror:
 
     def centre(self, mask: Mask | None) -> tuple[tuple[float, float, float], float]:
         """The centre and the radius of a mask; of the scene without one."""
+        self._follow_moves()
         if mask is None:
             return extent_of(self._means)
         extent = self._extent(mask)
         return extent.centre, extent.radius
+
+    def middle(self, mask: Mask) -> tuple[float, float, float]:
+        """The centre of a mask."""
+        return self.centre(mask)[0]
+
+    def _follow_moves(self) -> set[str]:
+        """Forget extents of masks of which something was moved; gives their ids."""
+        means = self._centres()
+        if means is self._means:
+            return set()
+        rows = np.flatnonzero((means != self._means).any(axis=1))
+        self._means = means
+        moved = {
+            id
+            for id, (mask, _) in self._kept.items()
+            if (self._confidence(mask)[rows] >= _MEMBER).any()
+        }
+        for id in moved:
+            del self._kept[id]
+        return moved
 
     def _object(self, one: Object) -> messages.ObjectInfo:
         extent = self._extent(one.mask)
@@ -131,8 +164,8 @@ class Mirror:
             sure = float(confidence[rows].mean()) / 255 if len(rows) else 0.0
             while len(self._kept) >= _MAX_KEPT:
                 del self._kept[next(iter(self._kept))]
-            self._kept[mask.id] = _Extent(centre, radius, round(sure, 4))
-        return self._kept[mask.id]
+            self._kept[mask.id] = mask, _Extent(centre, radius, round(sure, 4))
+        return self._kept[mask.id][1]
 
 
 def _edit(one: Edit) -> messages.EditInfo:
@@ -163,6 +196,8 @@ def scene_info(scene: Scene, name: str) -> messages.SceneInfo:
         centre=centre,
         radius=radius,
         home=_home(scene, centre, radius, up),
+        low_pass=scene.gaussians.low_pass,
+        antialiased=scene.gaussians.antialiased,
     )
 
 

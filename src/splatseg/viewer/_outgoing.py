@@ -16,6 +16,8 @@ VERSION = 1
 """Of the protocol. A page of another version is told to load itself again."""
 
 Stage = Literal["draft", "final"]
+Drawing = Literal["server", "gpu"]
+"""Who draws while the camera moves: the server, or the page on its own GPU."""
 
 _PATH = re.compile(r"(?<![\w/.])(?:[A-Za-z]:)?[/\\](?:[^\s/\\:'\"]+[/\\])+")
 
@@ -111,6 +113,8 @@ class SceneInfo(_Outgoing, kw_only=True):
     centre: tuple[float, float, float]
     radius: float
     home: HomeInfo
+    low_pass: float
+    antialiased: bool
 
 
 class FittingInfo(_Outgoing, kw_only=True):
@@ -131,6 +135,9 @@ class State(_Outgoing, kw_only=True, tag_field="type", tag="state"):
     words: bool
     modes: list[str]
     features: list[str]
+    ramp: list[str]
+    """Colours of the ramp that values are drawn in, evenly spaced, ``#rrggbb``."""
+
     document: DocumentInfo
     undo: str | None
     redo: str | None
@@ -138,6 +145,7 @@ class State(_Outgoing, kw_only=True, tag_field="type", tag="state"):
     me: int
     ready: bool
     fitting: FittingInfo | None
+    stage: Drawing
 
 
 class Patch(_Outgoing, kw_only=True, tag_field="type", tag="patch"):
@@ -166,6 +174,16 @@ class Selected(_Outgoing, kw_only=True, tag_field="type", tag="selected"):
     confidence: float
     milliseconds: float
     stages: dict[str, float]
+
+
+class Legend(_Outgoing, kw_only=True, tag_field="type", tag="legend"):
+    """What the ends of the ramp stand for in the picture at rest of a mode; None without a ramp.
+
+    Depth in scene units, else shares of 1.
+    """
+
+    mode: str
+    ends: tuple[float, float] | None
 
 
 class PointAnswer(_Outgoing, kw_only=True, tag_field="type", tag="point"):
@@ -220,8 +238,8 @@ class Error(_Outgoing, kw_only=True, tag_field="type", tag="error"):
 
 
 Outgoing: TypeAlias = (
-    State | Patch | Selected | PointAnswer | HintAnswer | Clients | Ready | Progress | Finished
-    | Error
+    State | Patch | Selected | Legend | PointAnswer | HintAnswer | Clients | Ready | Progress
+    | Finished | Error
 )  # fmt: skip
 
 
@@ -242,6 +260,18 @@ def id_map_bytes(camera: int, ids: NDArray[np.uint16]) -> bytes:
     height, width = ids.shape
     values = np.ascontiguousarray(ids, dtype="<u2").tobytes()
     return struct.pack("<cIHH", b"I", camera, width, height) + zlib.compress(values, 1)
+
+
+def codes_bytes(version: int, codes: NDArray[np.uint16]) -> bytes:
+    """The objects of all Gaussians: ``O``, u32 version, u32 count, zlib of a u16 code each."""
+    values = np.ascontiguousarray(codes, dtype="<u2").tobytes()
+    return struct.pack("<cII", b"O", version, len(codes)) + zlib.compress(values, 1)
+
+
+def selection_bytes(version: int, members: NDArray[np.bool_]) -> bytes:
+    """What is selected: ``S``, u32 version, u32 count, zlib of a bit each, the highest first."""
+    bits = np.packbits(members).tobytes()
+    return struct.pack("<cII", b"S", version, len(members)) + zlib.compress(bits, 1)
 
 
 def error_message(error: BaseException, **about: Any) -> Error:

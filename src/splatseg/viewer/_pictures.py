@@ -1,17 +1,22 @@
 """Pictures of a session's document: what is shown of it, and in which colours."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import time
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
-from splatseg.core import Camera
+from splatseg.core import Camera, Selection
+from splatseg.edit import transform
 from splatseg.viewer import _messages as messages
 from splatseg.viewer._document import MEMBER, Confidence, Document, Edit
 from splatseg.viewer._draw import Drawer, Picture
 from splatseg.viewer._session import Session
+from splatseg.viewer._shown import changes_rows, similarity_of
 
 _MAX_OBJECT = 32766
 _FIRST_SUGGESTION = 32768
@@ -20,11 +25,6 @@ _FIRST_THING = 49152
 
 
 Number = TypeVar("Number", bound=np.generic)
-
-
-def changes_rows(edits: Sequence[Edit]) -> bool:
-    """Whether edits draw other Gaussians than the scene has; what is removed is left out alone."""
-    return any(edit.kind != "remove" for edit in edits)
 
 
 class Pictures:
@@ -51,7 +51,10 @@ class Pictures:
         if self._edited is None or self._edited[0] != edits:
             self.close()
             scene = self._session.edited_scene()
-            self._edited = edits, Drawer(scene, backend=self._scene_drawer.backend)
+            self._edited = (
+                edits,
+                Drawer(scene, backend=self._scene_drawer.backend, views=self._session.views),
+            )
         return self._edited[1]
 
     def close(self) -> None:
@@ -73,6 +76,7 @@ class Pictures:
         *,
         selection: Confidence | None,
         words: str = "",
+        preview: Edit | None = None,
         scale: float = 1.0,
     ) -> Picture:
         """A picture of a camera.
@@ -82,20 +86,58 @@ class Pictures:
             camera: The camera.
             selection: What is tinted.
             words: What similarity is to; empty for the selection.
+            preview: A move that is drawn as if it were made.
             scale: Share of the camera's pixels.
         """
+        began = time.perf_counter()
         wants_objects = request.mode in ("objects", "blend")
         similarity = self._similarity(words) if request.mode == "similarity" else None
         look = self._look
-        return self.drawer.picture(
-            camera,
-            mode=request.mode,
-            selection=None if selection is None else look.drawn(selection),
-            objects=look.objects if wants_objects else (),
-            shown=self._shown(request),
-            similarity=None if similarity is None else look.drawn(similarity),
-            scale=scale,
+        with self._drawing(preview) as drawer:
+            picture = drawer.picture(
+                camera,
+                mode=request.mode,
+                selection=None if selection is None else look.drawn(selection),
+                objects=look.objects if wants_objects else (),
+                shown=self._shown(request),
+                similarity=None if similarity is None else look.drawn(similarity),
+                scale=scale,
+            )
+        return replace(picture, seconds=time.perf_counter() - began)
+
+    @contextmanager
+    def _drawing(self, preview: Edit | None) -> Generator[Drawer]:
+        """What draws a picture; with a move that is not made yet, for one picture alone."""
+        if preview is None:
+            yield self.drawer
+            return
+        session = self._session
+        chosen = self._look.drawn(session.confidence(preview.mask) >= MEMBER)
+        edits = changes_rows(session.document.edits)
+        if edits:
+            chosen &= ~session.shown.copies
+        if not chosen.any():
+            yield self.drawer
+            return
+        scene = session.edited_scene() if edits else session.scene
+        moved = transform(
+            scene.gaussians,
+            similarity_of(preview),
+            selection=Selection(mask=torch.from_numpy(chosen)),
         )
+        drawer = Drawer(
+            replace(scene, gaussians=moved.gaussians), backend=self._scene_drawer.backend
+        )
+        try:
+            yield drawer
+        finally:
+            drawer.close()
+
+    def surface(
+        self, camera: Camera, points: Sequence[tuple[float, float]]
+    ) -> list[NDArray[np.float64] | None]:
+        """The points of what is shown under pixels, see `Drawer.surface`."""
+        return self.drawer.surface(camera, points, shown=self._look.shown)
 
     def id_map(self, request: messages.DrawRequest) -> NDArray[np.uint16]:
         """The object or suggestion at each pixel, as the protocol has it.
@@ -153,8 +195,8 @@ class _Look:
         self.revision = document.revision
         self._session = session
         self._document = document
-        self._rows = session.edited_rows() if changes_rows(document.edits) else None
-        self.shown: NDArray[np.bool_] = self.drawn(session.visible)
+        self._rows = session.shown.rows if changes_rows(document.edits) else None
+        self.shown: NDArray[np.bool_] = self.drawn(session.shown.visible)
         self._owners: NDArray[np.int32] | None = None
         self._ids: NDArray[np.int32] | None = None
         self._objects: list[tuple[NDArray[np.bool_], tuple[int, int, int]]] | None = None
@@ -178,7 +220,7 @@ class _Look:
     def owners(self) -> NDArray[np.int32]:
         """The object of each Gaussian, -1 for none."""
         if self._owners is None:
-            self._owners = self.drawn(self._session.owners())
+            self._owners = self.drawn(self._session.shown.owners)
         return self._owners
 
     @property

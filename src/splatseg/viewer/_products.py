@@ -1,6 +1,6 @@
-"""What is made of a document: labels, an edited scene, and files.
+"""What is made of a document: labels, and files of a scene as it was edited.
 
-Edits become those of `splatseg.edit`, in their order; labels follow them row by row.
+Labels follow edits row by row.
 """
 
 import hashlib
@@ -16,16 +16,11 @@ from numpy.typing import NDArray
 from splatseg.core import (
     UNLABELLED,
     Edited,
-    Gaussians,
     InstanceFacts,
     Labels,
     LayerInfo,
     Scene,
-    Selection,
-    Similarity,
 )
-from splatseg.core.rigid import rotation_from_quaternion
-from splatseg.edit import duplicate, recolour, remove, transform
 from splatseg.errors import InputError, quoted
 from splatseg.io.atomic import named_write_failures, path_inside
 from splatseg.io.export.splats import holds_columns
@@ -36,13 +31,10 @@ from splatseg.tasks import ExportOptions, export_scene
 from splatseg.tasks.work import EXPORTS_FOLDER, Observer, layer_versions
 from splatseg.viewer._journal import command_to_json
 from splatseg.viewer._state import (
-    MEMBER,
     Command,
     Confidence,
     Document,
     Edit,
-    Masks,
-    Object,
 )
 
 METHOD = "view"
@@ -54,48 +46,9 @@ _LAYER = "objects"
 _SUFFIXES: Mapping[str, str] = {"splat": ".ply", "points": ".ply", "table": ".csv"}
 
 
-class Owners:
-    """Which object each Gaussian belongs to: the surest, of equally sure ones the later.
-
-    What was found is kept, and gone on with where objects were only added.
-
-    Args:
-        gaussians: Gaussians of the scene.
-        masks: The masks of the objects.
-    """
-
-    def __init__(self, gaussians: int, masks: Masks) -> None:
-        self._gaussians = gaussians
-        self._masks = masks
-        self._known: tuple[tuple[int, str], ...] = ()
-        self._ids = np.full(gaussians, UNLABELLED, np.int32)
-        self._sure = np.zeros(gaussians, np.uint8)
-
-    def of(self, objects: Sequence[Object]) -> tuple[NDArray[np.int32], Confidence]:
-        """The id of the object of each Gaussian, -1 for none, and its confidence, 0 to 255."""
-        wanted = tuple((one.id, one.mask.id) for one in objects)
-        done = len(self._known)
-        if wanted[:done] != self._known:
-            done = 0
-            self._ids = np.full(self._gaussians, UNLABELLED, np.int32)
-            self._sure = np.zeros(self._gaussians, np.uint8)
-        if done < len(wanted):
-            ids, sure = self._ids.copy(), self._sure.copy()
-            for one in objects[done:]:
-                confidence = self._masks.get(one.mask)
-                better = (confidence >= MEMBER) & (confidence >= sure)
-                ids[better] = one.id
-                sure[better] = confidence[better]
-            self._ids, self._sure = ids, sure
-        self._known = wanted
-        for array in (self._ids, self._sure):
-            array.flags.writeable = False
-        return self._ids, self._sure
-
-
 def labels_of(
     document: Document,
-    owners: Owners,
+    owned: tuple[NDArray[np.int32], Confidence],
     scene: Scene,
     commands: Sequence[Command],
     *,
@@ -105,7 +58,7 @@ def labels_of(
 
     Args:
         document: Whose objects.
-        owners: Which object each Gaussian belongs to.
+        owned: The id of the object of each Gaussian, -1 for none, and how sure it is of it.
         scene: The scene; its class table gives classes their ids.
         commands: What made the document, for the record.
         ids: Only these objects; None takes all.
@@ -116,7 +69,7 @@ def labels_of(
     chosen = document.objects if ids is None else [document.object(id) for id in ids]
     if not chosen:
         raise InputError("objects: expected at least one, got none; keep a selection first.")
-    found, sure = owners.of(document.objects)
+    found, sure = owned
     rows = np.isin(found, [one.id for one in chosen])
     classes = _class_ids(document, scene)
     made = [command_to_json(command) for command in commands]
@@ -151,22 +104,6 @@ def save(labels: Labels, root: Path, name: str) -> None:
     save_scene_layer(labels, root, name)
 
 
-def shown(document: Document, owners: Owners, masks: Masks) -> NDArray[np.bool_]:
-    """(n,) which Gaussians of the scene are shown.
-
-    Not those that were removed, nor those of hidden objects; where objects are isolated, theirs
-    alone.
-    """
-    ids, _ = owners.of(document.objects)
-    found = ~np.isin(ids, [one.id for one in document.objects if not one.visible])
-    if document.isolated:
-        found &= np.isin(ids, document.isolated)
-    for edit in document.edits:
-        if edit.kind == "remove":
-            found &= masks.get(edit.mask) < MEMBER
-    return found
-
-
 def digest_of(scene: Scene) -> str:
     """Tells the Gaussians of a scene from those of others: a digest of their centres."""
     means = scene.gaussians.means.detach().cpu().float().contiguous().numpy()
@@ -185,49 +122,6 @@ def _class_ids(document: Document, scene: Scene) -> dict[str, int]:
             known[name] = following
         found[name] = known[name]
     return found
-
-
-def similarity_of(edit: Edit) -> Similarity:
-    """The movement of an edit: x becomes about + s R (x - about) + t."""
-    rotation = rotation_from_quaternion(torch.tensor(edit.rotation, dtype=torch.float64))
-    about = torch.tensor(edit.about, dtype=torch.float64)
-    translation = torch.tensor(edit.translation, dtype=torch.float64)
-    return Similarity(
-        rotation=rotation,
-        translation=about + translation - edit.scale * (rotation @ about),
-        scale=edit.scale,
-    )
-
-
-def edited(gaussians: Gaussians, edits: Sequence[Edit], masks: Masks) -> Edited:
-    """Gaussians after edits, each of which is of those that were there before the first.
-
-    What was removed is not changed any more; copies stay as they were made.
-    """
-    found = Edited.unchanged(gaussians)
-    copied = torch.zeros(len(gaussians), dtype=torch.bool)
-    for edit in edits:
-        chosen = torch.from_numpy(masks.get(edit.mask) >= MEMBER)[found.rows] & ~copied
-        if not bool(chosen.any()):
-            continue
-        step = _step(found.gaussians, Selection(mask=chosen), edit)
-        copied = copied[step.rows]
-        copied[len(found) :] = True
-        found = found.then(step)
-    return found
-
-
-def _step(gaussians: Gaussians, selection: Selection, edit: Edit) -> Edited:
-    match edit.kind:
-        case "remove":
-            return remove(gaussians, selection)
-        case "duplicate":
-            return duplicate(gaussians, selection, similarity_of(edit))
-        case "move":
-            return transform(gaussians, similarity_of(edit), selection=selection)
-        case "recolour":
-            colour = [value / 255 for value in edit.colour or (0, 0, 0)]
-            return recolour(gaussians, selection, colour=colour)
 
 
 def exports_folder(scene: Scene, folder: Path | None) -> Path:
@@ -269,8 +163,10 @@ def export(
         observer: Is told of the progress.
 
     Raises:
-        InputError: If the name is none, or there is nothing to write.
+        InputError: If the name is none, or there is nothing to write: no object is left.
     """
+    if only is not None and labels is not None and not bool((labels.ids != UNLABELLED).any()):
+        raise InputError("export: nothing of these objects is left in the scene.")
     check_name("export", name)
     ending = f".{format.rstrip('3')}" if format is not None and what == "splat" else None
     path = folder / (name if "." in name else name + (ending or _SUFFIXES.get(what, "")))

@@ -1,30 +1,40 @@
 """What a page says that a person showed, as prompts of the library."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
-from splatseg.core import Scene, Selection, View
+from splatseg.core import Camera, Scene, Selection, View
 from splatseg.errors import InputError
-from splatseg.prompting.prompts import Ball, Lasso, SelectionPrompt, Similar, ViewPrompt
+from splatseg.prompting.prompts import Balls, Lasso, SelectionPrompt, Similar, ViewPrompt
 from splatseg.viewer import _messages as messages
-from splatseg.viewer._draw import Drawer
 
 _NO_NAME = "page"
 """Name of a view that is no photograph's."""
 
+_APART = 0.25
+"""Least distance of the middles of two balls of a brush, as a share of their radius."""
+
+Surface = Callable[[Camera, Sequence[messages.Point]], Sequence[NDArray[np.float64] | None]]
+"""The points of what is shown under pixels of a camera; None where nothing is."""
+
 
 def prompts_of(
-    request: messages.SelectRequest, scene: Scene, drawer: Drawer, selection: Selection | None
+    request: messages.SelectRequest,
+    scene: Scene,
+    *,
+    surface: Surface,
+    selection: Selection | None,
 ) -> Sequence[SelectionPrompt]:
     """The prompts of a request that shows something.
 
     Args:
         request: What was shown.
         scene: Has the views with photographs.
-        drawer: Knows how deep a pixel is.
+        surface: Knows how deep a pixel is.
         selection: What is selected: others like it are meant by similar.
 
     Raises:
@@ -37,7 +47,7 @@ def prompts_of(
     view = _view(request, scene)
     match request.kind:
         case "sphere":
-            return [_ball(request, view, drawer)]
+            return [_balls(request, view, surface)]
         case "lasso" | "polygon":
             return [Lasso(view=view, polygon=_points(request.points))]
         case "stroke":
@@ -68,14 +78,19 @@ def _box(request: messages.SelectRequest) -> torch.Tensor | None:
     return None if request.box is None else torch.tensor(request.box, dtype=torch.float32)
 
 
-def _ball(request: messages.SelectRequest, view: View, drawer: Drawer) -> Ball:
+def _balls(request: messages.SelectRequest, view: View, surface: Surface) -> Balls:
+    """The balls of a brush along its way; where nothing is under it, it leaves none."""
     if not request.points or request.radius is None:
         raise InputError("sphere: expected a point and a radius.")
-    found = drawer.depth(view.camera, *request.points[0])
-    if found is None:
+    centres = np.empty((0, 3))
+    for point in surface(view.camera, request.points):
+        if point is not None:
+            away = np.linalg.norm(centres - point, axis=1)
+            if (away >= _APART * request.radius).all():
+                centres = np.vstack((centres, point))
+    if not len(centres):
         raise InputError("sphere: there is nothing of the scene at this pixel; click on it.")
-    x, y, z = (float(value) for value in found)
-    return Ball(centre=(x, y, z), radius=request.radius)
+    return Balls(centres=torch.from_numpy(centres), radius=request.radius)
 
 
 def _points(points: Sequence[messages.Point]) -> torch.Tensor:

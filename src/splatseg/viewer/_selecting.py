@@ -1,4 +1,4 @@
-"""Clicks, strokes, places and words become confidences; a source of our own where a scene has none.
+"""Clicks, strokes, places and words become confidences.
 
 The source is opened once and kept, and so are the neighbours of the Gaussians, which cleaning,
 growing and filling holes look at too.
@@ -17,6 +17,7 @@ from torch import Tensor
 from splatseg.core import (
     UNLABELLED,
     Camera,
+    Edited,
     Features,
     Gaussians,
     InstanceTree,
@@ -30,14 +31,14 @@ from splatseg.core import (
 from splatseg.errors import InputError
 from splatseg.prompting.next_click import next_click
 from splatseg.prompting.pipeline import SceneIndex
-from splatseg.prompting.prompts import AxisBox, Ball, Lasso, SelectionPrompt, ViewPrompt
-from splatseg.prompting.seen import ViewCache, VisiblePrompt
+from splatseg.prompting.prompts import Lasso, SelectionPrompt, Solid, ViewPrompt
+from splatseg.prompting.seen import ViewCache
 from splatseg.render import BackendName
-from splatseg.selection import pieces
 from splatseg.tasks.query import QuerySession
 from splatseg.tasks.select import SelectionSession, open_selector, prompt_record
 from splatseg.tasks.sources import QueryOptions, SelectOptions
 from splatseg.tasks.work import Observer, Work
+from splatseg.viewer._colour_source import ColourSource
 from splatseg.viewer._products import METHOD
 from splatseg.viewer._shaping import Mode
 from splatseg.viewer._state import MEMBER, Confidence
@@ -50,107 +51,8 @@ Draft = Callable[[Confidence], None]
 _ANSWERING = ("objects", "voxels", "features")
 """Methods whose layers answer words, the best first."""
 
-_WIDEST, _FINEST = 0.62, 0.10
-"""Distances of colours in [0, 1] that are alike to a group, and to the finest part."""
-
-_POINTED_AT = 0.1
-"""Least blending weight of a Gaussian in a pixel that points at it."""
-
-_MAX_SEEDS = 16
-"""Most Gaussians that were pointed at whose colours others are compared with."""
-
 _MAX_PROMPTS = 64
 """Most prompts of a selection that are recorded, the last."""
-
-_IN, _OUT = 0.501, 0.499
-
-
-class ColourSource:
-    """What is connected to a click and of about its colour: for scenes that know nothing better.
-
-    With d the distance of a Gaussian's mean colour to the nearest colour that was pointed at, and t
-    how far is alike, it may belong where d < t, and belongs if touching ones of these lead to it
-    from what was pointed at. Where something else was pointed at too, colour and place together
-    must be nearer to the thing.
-
-    Args:
-        gaussians: The Gaussians of the scene.
-        neighbours: Which of them touch.
-    """
-
-    def __init__(self, gaussians: Gaussians, neighbours: SceneIndex) -> None:
-        self._gaussians = gaussians
-        self._neighbours = neighbours
-
-    def membership(
-        self, prompts: Sequence[VisiblePrompt], *, granularity: float | None
-    ) -> Float[Tensor, "n"]:
-        """How likely each Gaussian belongs to what prompts show, see `MembershipSource`."""
-        inside, outside = (
-            self._pointed_at(prompts, positive=True),
-            self._pointed_at(prompts, positive=False),
-        )
-        fineness = 0.5 if granularity is None else granularity
-        alike = _WIDEST + (_FINEST - _WIDEST) * fineness
-        colour = self._nearest(self._colours, inside)
-        likely = (1 - 0.5 * colour / alike).clamp(0, 1)
-        candidates = colour < alike
-        if len(outside):
-            means = self._gaussians.means.detach().cpu().double()
-            apart = float(self._nearest(means, inside)[outside].mean())
-            near = colour / alike + self._nearest(means, inside) / max(apart, 1e-9)
-            far = self._nearest(self._colours, outside) / alike
-            far = far + self._nearest(means, outside) / max(apart, 1e-9)
-            candidates &= near < far
-        for prompt in prompts:
-            if prompt.inside is not None:
-                candidates &= _seen_within(self._gaussians, prompt)
-        candidates[inside] = True
-        member = self._connected(candidates, inside)
-        return torch.where(member, likely.clamp_min(_IN), likely.clamp_max(_OUT)).float()
-
-    @property
-    def _colours(self) -> Tensor:
-        return self._gaussians.colours.detach().cpu().double().clamp(0, 1)
-
-    def _pointed_at(self, prompts: Sequence[VisiblePrompt], *, positive: bool) -> Tensor:
-        """Rows of what pixels of one sign show most of, the most first."""
-        mass = torch.zeros(len(self._gaussians), dtype=torch.float64)
-        for prompt in prompts:
-            rows = prompt.positive_rows if positive else prompt.negative_rows
-            weights = rows.weights.detach().cpu().double()
-            sure = weights >= min(_POINTED_AT, float(weights.max()) if len(weights) else 0.0)
-            mass.index_add_(0, rows.ids.long().cpu()[sure], weights[sure])
-        return torch.argsort(mass, descending=True, stable=True)[: int((mass > 0).sum())]
-
-    def _nearest(self, values: Tensor, rows: Tensor) -> Tensor:
-        """Distance of each Gaussian's values to the nearest of some rows."""
-        return torch.cdist(values, values[rows[:_MAX_SEEDS]]).amin(dim=1)
-
-    def _connected(self, candidates: Tensor, seeds: Tensor) -> Tensor:
-        rows = torch.nonzero(candidates).squeeze(1)
-        position = torch.full((len(candidates),), -1, dtype=torch.int64)
-        position[rows] = torch.arange(len(rows))
-        edges = self._neighbours.graph.edges(rows)
-        linked = edges.touching & (position[edges.second] >= 0)
-        piece_of = pieces(len(rows), edges.first[linked], position[edges.second[linked]])
-        reached = torch.isin(piece_of, piece_of[position[seeds]])
-        member = torch.zeros_like(candidates)
-        member[rows[reached]] = True
-        return member
-
-
-def _seen_within(gaussians: Gaussians, prompt: VisiblePrompt) -> Tensor:
-    """Which Gaussians have their centre where a box or a mask allows the thing to be."""
-    if prompt.inside is None:
-        return torch.ones(len(gaussians), dtype=torch.bool)
-    camera = prompt.view.camera
-    pixels, depth = camera.project(gaussians.means.detach().cpu().double())
-    x, y = pixels.floor().long().unbind(dim=1)
-    there = (depth > 0) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
-    found = torch.zeros(len(gaussians), dtype=torch.bool)
-    found[there] = prompt.inside.cpu()[y[there], x[there]]
-    return found
 
 
 class Selecting:
@@ -158,11 +60,19 @@ class Selecting:
 
     Args:
         scene: The scene.
+        shown: What a view shows instead of the scene, see `ViewCache`.
         backend: Rendering backend.
         observer: Is told of what is opened.
     """
 
-    def __init__(self, scene: Scene, *, backend: BackendName, observer: Observer) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        shown: Callable[[View | None], Edited | None],
+        backend: BackendName,
+        observer: Observer,
+    ) -> None:
         self._scene = scene
         self._backend: BackendName = backend
         self._observer = observer
@@ -172,7 +82,7 @@ class Selecting:
         self._work = Work(scene=scene, backend=backend, observer=observer)
         self._things: NDArray[np.int32] | None = None
         self.neighbours = SceneIndex(scene.gaussians)
-        self.views = ViewCache(scene.gaussians, backend=backend)
+        self.views = ViewCache(scene.gaussians, backend=backend, edited=shown)
         self.seconds: Mapping[str, float] = {}
 
     def close(self) -> None:
@@ -241,51 +151,47 @@ class Selecting:
         middle = [[view.camera.width / 2, view.camera.height / 2]]
         try:
             prompt = ViewPrompt(view=view, points=torch.tensor(middle))
-            self.select((prompt,), level=None)
+            self.select(prompt, level=None, draft=lambda _: None)
         except InputError:
             # The middle of the view is sky: all that takes long was opened.
             return
 
     def select(
         self,
-        prompts: Sequence[SelectionPrompt],
+        prompts: SelectionPrompt | Sequence[SelectionPrompt] | str,
         *,
         level: float | None,
-        draft: Callable[[Selection], None] | None = None,
+        draft: Callable[[Selection], None],
     ) -> tuple[Selection, dict[str, Any]]:
         """What prompts mean, and the record of it.
 
         Args:
-            prompts: What is shown; at least one.
+            prompts: What is shown; at least one. Or words.
             level: 0 asks for the finest parts, 0.5 for objects, 1 for groups; None lets the source
                 choose.
             draft: Is called with what the source says, before it is cleaned.
 
         Raises:
-            InputError: If nothing is shown, or what is shown is nothing.
+            InputError: If nothing is shown, or what is shown is nothing; no layer answers words,
+                or nothing answers to these.
         """
+        if isinstance(prompts, str):
+            answers = self._asked().ask([prompts])
+            draft(answers.selection())
+            record = {"kind": "words", "text": prompts}
+            return answers.selection(), {"source": f"layer {answers.layer}", "prompts": [record]}
+        given = (prompts,) if isinstance(prompts, SelectionPrompt) else tuple(prompts)
         selector = self._opened()
         options = replace(self._options(), granularity="auto" if level is None else 1 - level)
 
         def tell(confidence: Tensor) -> None:
-            if draft is not None:
-                draft(Selection.of_confidence(confidence.cpu()))
+            draft(Selection.of_confidence(confidence.cpu()))
 
-        made = selector.select(prompts, options=options, advise=False, draft=tell)
+        made = selector.select(given, options=options, advise=False, draft=tell)
         self.seconds = dict(made.seconds)
-        places = all(isinstance(prompt, AxisBox | Ball | Lasso) for prompt in prompts)
+        places = all(isinstance(prompt, Solid) for prompt in given)
         source = "" if places else (self.source or COLOUR)
-        return made.selection, {"source": source, "prompts": self._records(prompts, level)}
-
-    def find_words(self, words: str) -> tuple[Selection, dict[str, Any]]:
-        """What answers to words, and the record of it.
-
-        Raises:
-            InputError: If no layer answers words, or nothing answers to these.
-        """
-        answers = self._asked().ask([words])
-        record = {"kind": "words", "text": words}
-        return answers.selection(), {"source": f"layer {answers.layer}", "prompts": [record]}
+        return made.selection, {"source": source, "prompts": self._records(given, level)}
 
     def similarity(self, words: str) -> Float[Tensor, "n"]:
         """How likely words mean each Gaussian, in [0, 1].
@@ -349,7 +255,7 @@ class Selecting:
         if self._selector is None:
             gaussians, own = self._scene.gaussians, None
             if self._choice()[0] is None:
-                own = ColourSource(gaussians, self.neighbours)
+                own = ColourSource(gaussians, self.neighbours, self.views)
             self._selector = open_selector(
                 self._scene,
                 options=self._options(),

@@ -21,7 +21,8 @@ from splatseg.io.atomic import path_inside
 from splatseg.render import BackendName
 from splatseg.viewer import _guard as guard
 from splatseg.viewer import _messages as messages
-from splatseg.viewer._worker import Client, Worker, about
+from splatseg.viewer._client import Client
+from splatseg.viewer._worker import Worker, about
 
 STATIC = Path(__file__).parent / "static"
 """The page."""
@@ -65,6 +66,7 @@ class ViewServer:
             host=host, port=self._listening.getsockname()[1], embedded=embedded
         )
         self._logins = guard.Rate(guard.LOGINS_A_MINUTE, seconds=60)
+        self._loads = guard.Rate(guard.GAUSSIANS_A_MINUTE, seconds=60)
         self._server: Any = None
         self._thread: threading.Thread | None = None
         self._ended = threading.Event()
@@ -104,6 +106,7 @@ class ViewServer:
                 lifespan="off",
                 limit_concurrency=8 * guard.MAX_CLIENTS,
                 timeout_graceful_shutdown=1,
+                ws="websockets-sansio",  # what "auto" is in later versions of uvicorn
                 ws_max_size=guard.MAX_MESSAGE,
                 ws_per_message_deflate=False,
             )
@@ -149,6 +152,7 @@ class ViewServer:
                 Route("/login", self._login, methods=["POST"]),
                 Route("/photographs/{name:path}", self._photograph),
                 Route("/exports/{name}", self._exported),
+                Route("/gaussians", self._gaussians),
                 WebSocketRoute("/socket", self._socket),
                 Mount("/static", StaticFiles(directory=STATIC, check_dir=False)),
             ]
@@ -216,6 +220,27 @@ class ViewServer:
             return PlainTextResponse("no such file\n", status_code=404)
         return FileResponse(path, filename=name, headers={"cache-control": "no-store"})
 
+    async def _gaussians(self, request: Any) -> Any:
+        """The Gaussians that a page draws, by the version that it was told."""
+        from starlette.responses import FileResponse, PlainTextResponse
+
+        version = request.query_params.get("version", "")
+        if not (version.isascii() and version.isdigit() and len(version) < 11):
+            return PlainTextResponse("version: expected a number\n", status_code=400)
+        if not self._loads.allows():
+            return PlainTextResponse("too many; wait a minute\n", status_code=429)
+        try:
+            path = await asyncio.wrap_future(
+                self.worker.call(lambda answers: answers.gaussians(int(version)))
+            )
+        except SplatsegError:
+            return PlainTextResponse("there are none of this version\n", status_code=404)
+        except CancelledError:
+            return PlainTextResponse("busy\n", status_code=503)
+        return FileResponse(
+            path, media_type="application/octet-stream", headers={"cache-control": "no-store"}
+        )
+
     async def _socket(self, websocket: Any) -> None:
         """One page, from its hello to its end."""
         from starlette.websockets import WebSocketDisconnect
@@ -223,10 +248,11 @@ class ViewServer:
         await websocket.accept()
         # Any way in which a connection ends while it is written to.
         with contextlib.suppress(WebSocketDisconnect, RuntimeError, OSError):
-            if not await self._welcome(websocket):
+            hello = await self._welcome(websocket)
+            if hello is None:
                 return
             page = _Page(websocket, self.worker)
-            client = self.worker.join(page.post)
+            client = self.worker.join(page.post, hello.stage)
             if client is None:
                 text = f"{guard.MAX_CLIENTS} pages are open, which is the most"
                 await page.say(messages.Error(text=text, fix="close another one"))
@@ -242,28 +268,28 @@ class ViewServer:
                     task.cancel()
                 await asyncio.gather(*tasks, return_exceptions=True)
 
-    async def _welcome(self, websocket: Any) -> bool:
-        """Whether the first message is a hello of our version, from who has access."""
+    async def _welcome(self, websocket: Any) -> messages.Hello | None:
+        """The first message, if it is a hello of our version, from who has access."""
         try:
             first = await asyncio.wait_for(websocket.receive(), _HELLO_SECONDS)
             hello = messages.parse(first.get("text") or "")
         except (TimeoutError, InputError):
             await websocket.close(_POLICY)
-            return False
+            return None
         if not isinstance(hello, messages.Hello):
             await websocket.close(_POLICY)
-            return False
+            return None
         if not (self.access.admits(websocket.scope) or self.access.knows_token(hello.token)):
             await websocket.close(_POLICY)
-            return False
+            return None
         if hello.version != messages.VERSION:
             error = messages.Error(
                 text="the page is of another version than the server", fix="load the page again"
             )
             await websocket.send_text(messages.form(error))
             await websocket.close(_POLICY)
-            return False
-        return True
+            return None
+        return hello
 
 
 class _Login(msgspec.Struct, forbid_unknown_fields=True):
@@ -392,6 +418,7 @@ def serve(
     embedded: bool = False,
     layer: str | None = None,
     backend: BackendName = "auto",
+    stage: messages.Drawing = "server",
 ) -> ViewServer:
     """A server of a scene that has been started; close it.
 
@@ -402,11 +429,12 @@ def serve(
         embedded: Whether pages of notebooks may show the page.
         layer: A layer whose objects are suggested at once.
         backend: Rendering backend.
+        stage: Who draws while the camera moves, unless a page chooses otherwise.
     """
     from splatseg.viewer._answers import opener
 
     server = ViewServer(
-        Worker(opener(scene, layer=layer, backend=backend)),
+        Worker(opener(scene, layer=layer, backend=backend, stage=stage)),
         host=host,
         port=port,
         embedded=embedded,

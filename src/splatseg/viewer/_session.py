@@ -17,19 +17,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from splatseg.core import (
-    UNLABELLED,
-    Edited,
-    Labels,
-    Scene,
-    Selection,
-    apply_rows,
-)
+from splatseg.core import Labels, Scene, Selection, apply_rows
 from splatseg.errors import InputError
 from splatseg.io.scene import load_scene
 from splatseg.io.scene_folder import scene_path
 from splatseg.io.splats import WritableFormat, read_splats
-from splatseg.prompting.prompts import AxisBox, Ball, Lasso, SelectionPrompt, Similar, ViewPrompt
+from splatseg.prompting.prompts import SelectionPrompt
 from splatseg.prompting.seen import ViewCache
 from splatseg.render import BackendName
 from splatseg.tasks.work import SILENT, Observer
@@ -37,7 +30,6 @@ from splatseg.viewer import _products as products
 from splatseg.viewer import _shaping as shaping
 from splatseg.viewer._editor import Callback, Editor
 from splatseg.viewer._journal import Journal
-from splatseg.viewer._masks import MaskStore
 from splatseg.viewer._selecting import (
     Selecting,
     bytes_of,
@@ -46,16 +38,15 @@ from splatseg.viewer._selecting import (
     selection_of,
 )
 from splatseg.viewer._shaping import Mode, SplitBy
+from splatseg.viewer._shown import Shown
 from splatseg.viewer._state import (
     Command,
     Confidence,
     Document,
-    History,
     Mask,
     Select,
     Split,
     Suggest,
-    free_name,
 )
 
 VIEW_FOLDER = "view"
@@ -90,8 +81,8 @@ def open_session(
         place = scene_path(scene.root, VIEW_FOLDER)
     journal = None
     if place is not None:
-        count = len(scene.gaussians)
-        journal = Journal(place, gaussians=count, digest=products.digest_of(scene))
+        digest = products.digest_of(scene)
+        journal = Journal(place, gaussians=len(scene.gaussians), digest=digest)
         for note in journal.notes:
             observer.note(note)
     return Session(scene, journal=journal, folder=place, backend=backend, observer=observer)
@@ -100,7 +91,8 @@ def open_session(
 class Session:
     """A scene, its document, and what can be done with both; a context that closes it.
 
-    `open_session` makes it.
+    `open_session` makes it. Its `masks` are found by their content, its `history` is what was done
+    and undone, and `shown` is what is shown of the scene: edits made, without what is hidden.
 
     Args:
         scene: The scene; it stays as it is.
@@ -124,10 +116,11 @@ class Session:
         self._backend: BackendName = backend
         self._observer = observer
         self._editor = Editor(len(scene.gaussians), journal)
-        self._masks, self._history = self._editor.masks, self._editor.history
-        self._selecting = Selecting(scene, backend=backend, observer=observer)
-        self._owners = products.Owners(len(scene.gaussians), self._masks)
-        self._edited: tuple[tuple[object, ...], Edited] | None = None
+        self.masks, self.history = self._editor.masks, self._editor.history
+        self.shown = Shown(scene, self.masks, lambda: self.document)
+        self._selecting = Selecting(
+            scene, shown=self.shown.in_view, backend=backend, observer=observer
+        )
 
     def __enter__(self) -> Self:
         return self
@@ -148,37 +141,12 @@ class Session:
     @property
     def document(self) -> Document:
         """As it is now."""
-        return self._history.document
+        return self.history.document
 
     @property
     def revision(self) -> int:
         """Of the document."""
         return self.document.revision
-
-    @property
-    def history(self) -> History:
-        """What was done and undone. `do`, `undo` and `redo` of the session change it."""
-        return self._history
-
-    @property
-    def masks(self) -> MaskStore:
-        """Masks by their content."""
-        return self._masks
-
-    @property
-    def labels_of_commands(self) -> tuple[str, ...]:
-        """What is done, in words, the first first."""
-        return tuple(entry.label for entry in self._history.entries)
-
-    @property
-    def undo_label(self) -> str | None:
-        """What undoing would take back; None where there is nothing."""
-        return self._history.undo_label
-
-    @property
-    def redo_label(self) -> str | None:
-        """What redoing would do again; None where there is nothing."""
-        return self._history.redo_label
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -212,23 +180,7 @@ class Session:
     def selected(self) -> Selection | None:
         """What is selected; None where nothing is."""
         mask = self.document.selection
-        return None if mask is None else selection_of(self._masks.get(mask))
-
-    @property
-    def visible(self) -> NDArray[np.bool_]:
-        """(n,) which Gaussians of the scene are shown.
-
-        Not those that were removed, nor those of hidden objects; where objects are isolated,
-        theirs alone.
-        """
-        return products.shown(self.document, self._owners, self._masks)
-
-    def owners(self) -> NDArray[np.int32]:
-        """(n,) the id of the object that each Gaussian belongs to, -1 for none.
-
-        Of several objects it is the one that is surest of it, of equally sure ones the later.
-        """
-        return self._owners.of(self.document.objects)[0]
+        return None if mask is None else selection_of(self.masks.get(mask))
 
     @property
     def things(self) -> NDArray[np.int32]:
@@ -240,7 +192,7 @@ class Session:
 
     def confidence(self, mask: Mask) -> Confidence:
         """(n,) uint8 confidences of a mask, 0 to 255; from 128 on a Gaussian belongs to it."""
-        return self._masks.get(mask)
+        return self.masks.get(mask)
 
     def subscribe(self, callback: Callback) -> Callable[[], None]:
         """Be told of each change: the document before, the document after, the author.
@@ -326,23 +278,30 @@ class Session:
         under = self.document.selection if isinstance(base, EllipsisType) else base
         if under is None and mode in ("remove", "intersect"):
             raise InputError(f"{mode}: expected a selection, got none; select something first.")
-        below = None if under is None or mode == "set" else self._masks.get(under)
+        below = None if under is None or mode == "set" else self.masks.get(under)
 
         def tell(selection: Selection) -> None:
             if draft is not None:
                 draft(shaping.combined(bytes_of(selection), below, mode))
 
-        if isinstance(prompts, str):
-            made, record = self._selecting.find_words(prompts)
-            tell(made)
-        else:
-            one = isinstance(prompts, ViewPrompt | AxisBox | Ball | Lasso | Similar)
-            given = (prompts,) if one else tuple(prompts)
-            made, record = self._selecting.select(given, level=level, draft=tell)
+        made, record = self._selecting.select(prompts, level=level, draft=tell)
         earlier = self.document.prompt if under == self.document.selection else None
         record = joined_record(record, None if below is None else earlier, mode)
-        mask = self._masks.put(shaping.combined(bytes_of(made), below, mode))
-        return self.do(Select(mask if mask.count else None, record), author=author)
+        values = shaping.combined(bytes_of(made), below, mode)
+        return self.select_values(values, record, author=author)
+
+    def select_values(
+        self, values: Confidence, record: Mapping[str, Any], *, author: str = ""
+    ) -> Document:
+        """Select by confidences; Gaussians that were removed are left out.
+
+        Args:
+            values: (n,) from 0 to 255, from 128 on for what is selected.
+            record: What selected it, in values that JSON holds.
+            author: Who does it.
+        """
+        mask = self.masks.put(np.where(self.shown.present, values, 0).astype(np.uint8))
+        return self.do(Select(mask if mask.count else None, dict(record)), author=author)
 
     def similarity(self, words: str) -> NDArray[np.float32]:
         """(n,) how likely words mean each Gaussian, in [0, 1].
@@ -381,8 +340,9 @@ class Session:
         Raises:
             InputError: If nothing is selected.
         """
-        values = shaping.grown(self._selected(), self._selecting.neighbours, factor)
-        return self._reselect(values, "grow", factor, author)
+        near = self._selecting.neighbours
+        step = {"kind": "grow", "factor": factor}
+        return self._reshape(lambda values: shaping.grown(values, near, factor), step, author)
 
     def shrink(self, factor: float = 1.0, *, author: str = "") -> Document:
         """Take what is near to the outside off the selection; `factor` as in `grow`.
@@ -390,9 +350,11 @@ class Session:
         Raises:
             InputError: If nothing is selected, or nothing would be left.
         """
-        neighbours = self._selecting.neighbours
-        values = shaping.shrunk(self._selected(), self._scene.gaussians, neighbours, factor)
-        return self._reselect(values, "shrink", factor, author)
+        near, gaussians = self._selecting.neighbours, self._scene.gaussians
+        step = {"kind": "shrink", "factor": factor}
+        return self._reshape(
+            lambda values: shaping.shrunk(values, gaussians, near, factor), step, author
+        )
 
     def fill_holes(self, *, author: str = "") -> Document:
         """Add small gaps within the selection.
@@ -400,20 +362,17 @@ class Session:
         Raises:
             InputError: If nothing is selected.
         """
-        values = shaping.filled(self._selected(), self._selecting.neighbours)
-        return self._reselect(values, "fill_holes", None, author)
+        near, step = self._selecting.neighbours, {"kind": "fill_holes"}
+        return self._reshape(lambda values: shaping.filled(values, near), step, author)
 
-    def _selected(self) -> Confidence:
+    def _reshape(
+        self, shaped: Callable[[Confidence], Confidence], step: dict[str, Any], author: str
+    ) -> Document:
         if self.document.selection is None:
             raise InputError("selection: expected one, got none; select something first.")
-        return self._masks.get(self.document.selection)
-
-    def _reselect(
-        self, values: Confidence, what: str, factor: float | None, author: str
-    ) -> Document:
-        step: dict[str, Any] = {"kind": what} | ({} if factor is None else {"factor": factor})
+        values = shaped(self.masks.get(self.document.selection))
         record = recorded_after(self.document.prompt, [step])
-        return self.do(Select(self._masks.put(values), record), author=author)
+        return self.select_values(values, record, author=author)
 
     # Objects.
 
@@ -424,7 +383,7 @@ class Session:
             InputError: If there is no such layer, or it has no things.
         """
         found = self._selecting.layer(layer)
-        made = shaping.suggestions_of(found, self._masks, name=layer)
+        made = shaping.suggestions_of(found, self.masks, name=layer)
         return self.do(Suggest(made), author=author)
 
     def split(
@@ -449,20 +408,16 @@ class Session:
         Raises:
             InputError: If it has no two parts.
         """
-        one = self.document.object(id)
-        confidence = self._masks.get(one.mask)
-        gaussians = self._scene.gaussians
-        tree = self._selecting.tree() if by == "tree" else None
-        part = shaping.numbered_parts(confidence, gaussians, by, tree=tree, plane=plane)
-        means = gaussians.means.detach().cpu().double().numpy()
-        parts = shaping.parts_of(part, confidence, means, what=by)
-        taken = {other.name for other in self.document.objects}
-        names = [one.name]
-        for _ in parts[1:]:
-            names.append(free_name(one.name, taken))
-            taken.add(names[-1])
-        masks = tuple(self._masks.put(values) for values in parts)
-        return self.do(Split(id, masks, tuple(names)), author=author, revision=revision)
+        parts = shaping.parts_of(
+            self.confidence(self.document.object(id).mask),
+            self._scene.gaussians,
+            by,
+            tree=self._selecting.tree() if by == "tree" else None,
+            plane=plane,
+        )
+        masks = tuple(self.masks.put(values) for values in parts)
+        names = shaping.names_of_parts(self.document, id, len(masks))
+        return self.do(Split(id, masks, names), author=author, revision=revision)
 
     # What is taken away.
 
@@ -477,9 +432,9 @@ class Session:
         """
         return products.labels_of(
             self.document,
-            self._owners,
+            self.shown.owned,
             self._scene,
-            [entry.command for entry in self._history.entries],
+            [entry.command for entry in self.history.entries],
             ids=None if ids is None else tuple(ids),
         )
 
@@ -523,9 +478,7 @@ class Session:
         only = None if ids is None else tuple(ids)
         labels = None
         if self.document.objects or only is not None:
-            labels = apply_rows(self.labels(only), self._edits())
-            if only is not None and not bool((labels.ids != UNLABELLED).any()):
-                raise InputError("export: nothing of these objects is left in the scene.")
+            labels = apply_rows(self.labels(only), self.shown.edited)
         return products.export(
             self.edited_scene(),
             labels,
@@ -540,15 +493,4 @@ class Session:
 
     def edited_scene(self) -> Scene:
         """The scene with its edits; without a folder, unless there are none."""
-        return products.edited_scene(self._scene, self._edits(), self.document.edits)
-
-    def edited_rows(self) -> NDArray[np.int64]:
-        """(m,) of each Gaussian of the edited scene, the row in the scene that it comes from."""
-        return self._edits().rows.numpy()
-
-    def _edits(self) -> Edited:
-        edits = self.document.edits
-        if self._edited is None or self._edited[0] != edits:
-            made = products.edited(self._scene.gaussians, edits, self._masks)
-            self._edited = edits, made
-        return self._edited[1]
+        return products.edited_scene(self._scene, self.shown.edited, self.document.edits)

@@ -13,7 +13,15 @@ from splatseg.neighbours import NeighbourIndex, Subset
 from splatseg.prompting.graph import holes
 from splatseg.prompting.pipeline import SceneIndex, growth_radius
 from splatseg.selection import components
-from splatseg.viewer._state import MAX_NAME, MEMBER, Confidence, Masks, Suggestion
+from splatseg.viewer._state import (
+    MAX_NAME,
+    MEMBER,
+    Confidence,
+    Document,
+    Masks,
+    Suggestion,
+    free_name,
+)
 
 Mode = Literal["set", "add", "remove", "intersect"]
 SplitBy = Literal["parts", "tree", "plane"]
@@ -102,15 +110,25 @@ def _around(values: Confidence, neighbours: SceneIndex, factor: float) -> tuple[
     return subset, factor * radius * (1 + _ROUNDING)
 
 
-def numbered_parts(
+def names_of_parts(document: Document, id: int, count: int) -> tuple[str, ...]:
+    """Names of the parts of an object, the first its own."""
+    taken = {one.name for one in document.objects}
+    names = [document.object(id).name]
+    while len(names) < count:
+        names.append(free_name(names[0], taken))
+        taken.add(names[-1])
+    return tuple(names)
+
+
+def parts_of(
     confidence: Confidence,
     gaussians: Gaussians,
     by: SplitBy,
     *,
     tree: InstanceTree | None,
     plane: Sequence[float] | None,
-) -> NDArray[np.int64]:
-    """(n,) number of the part of a thing that each Gaussian is in, -1 where that is not known.
+) -> list[Confidence]:
+    """The Gaussians of a thing shared out among its parts, the largest first.
 
     Args:
         confidence: (n,) of the thing.
@@ -120,8 +138,22 @@ def numbered_parts(
         plane: a, b, c, d of a x + b y + c z + d = 0, world, scene units.
 
     Raises:
-        InputError: If what it is parted by is missing, or no plane.
+        InputError: If what it is parted by is missing, or no plane, or it has no two parts that are
+            large enough.
     """
+    part = _numbered(confidence, gaussians, by, tree=tree, plane=plane)
+    return _shared_out(part, confidence, gaussians.means.detach().cpu().double().numpy(), what=by)
+
+
+def _numbered(
+    confidence: Confidence,
+    gaussians: Gaussians,
+    by: SplitBy,
+    *,
+    tree: InstanceTree | None,
+    plane: Sequence[float] | None,
+) -> NDArray[np.int64]:
+    """(n,) number of the part of a thing that each Gaussian is in, -1 where that is not known."""
     if (plane is not None) != (by == "plane"):
         raise InputError("split: expected a plane with by plane, and with it alone.")
     if by == "parts":
@@ -138,20 +170,10 @@ def numbered_parts(
     return (means @ values[:3] + values[3] > 0).astype(np.int64)
 
 
-def parts_of(
+def _shared_out(
     part: NDArray[np.int64], confidence: Confidence, means: NDArray[np.float64], *, what: str
 ) -> list[Confidence]:
-    """The Gaussians of a thing shared out among its parts, the largest first.
-
-    Args:
-        part: (n,) number of the part of each Gaussian; -1 for those of which that is not known.
-        confidence: (n,) of the thing.
-        means: (n, 3) centres.
-        what: How it was parted, for the message.
-
-    Raises:
-        InputError: If it has no two parts that are large enough.
-    """
+    """What has no number, or that of a part that is too small, goes to the part that is nearest."""
     rows = np.nonzero(confidence >= MEMBER)[0]
     own = part[rows]
     numbers, counts = np.unique(own[own >= 0], return_counts=True)

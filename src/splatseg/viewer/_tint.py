@@ -35,6 +35,9 @@ def _ramp() -> NDArray[np.uint8]:
 RAMP: NDArray[np.uint8] = _ramp()
 """256 colours from dark blue to yellow, of evenly rising lightness (viridis)."""
 
+RAMP_STOPS = tuple("#" + bytes(RAMP[level]).hex() for level in range(0, 256, 15))
+"""Evenly spaced colours of it, as a page writes them, the first and the last among them."""
+
 _SELECTED_LEVELS = np.where(
     np.arange(256) >= MEMBER, np.round(np.arange(256) * _SELECTED_SHARE), 0
 ).astype(np.uint8)
@@ -82,11 +85,16 @@ def ramp_tint(values: NDArray[np.uint8], *, covers: bool) -> Tint:
     return tint
 
 
-def stretched(values: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Levels from 0, the first percentile of the values, to 255, the largest."""
+def range_of(values: NDArray[np.float32]) -> tuple[float, float]:
+    """The first percentile of values and the largest; 0 and 1 without any."""
     if len(values) == 0:
-        return np.zeros(0, np.uint8)
-    low, high = float(np.percentile(values, 1)), float(values.max())
+        return 0.0, 1.0
+    return float(np.percentile(values, 1)), float(values.max())
+
+
+def stretched(values: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Levels from 0 to 255 for the ends of `range_of`."""
+    low, high = range_of(values)
     span = max(high - low, 1e-9)
     return np.round(255 * np.clip((values - low) / span, 0, 1)).astype(np.uint8)
 

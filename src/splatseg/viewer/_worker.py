@@ -14,10 +14,14 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias, TypeVar
 
+import msgspec
+
 from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError, SplatsegError
 from splatseg.viewer import _guard as guard
+from splatseg.viewer import _memory as memory
 from splatseg.viewer import _messages as messages
+from splatseg.viewer._client import Cancelled, Client, Job
 
 T = TypeVar("T")
 
@@ -28,87 +32,6 @@ _MAX_JOBS = 4
 """Most jobs of one page, waiting or running."""
 
 _log = logging.getLogger("splatseg.viewer")
-
-
-class Cancelled(Exception):
-    """A job was cancelled, or the server ends."""
-
-
-class Client:
-    """A page: where answers go, and what it asked for last."""
-
-    def __init__(self, id: int, post: Callable[[str | bytes], None]) -> None:
-        self.id = id
-        self._post = post
-        self.waiting_camera: messages.DrawRequest | None = None
-        """The newest camera that was not drawn yet."""
-
-        self.camera: messages.DrawRequest | None = None
-        """The last one that was drawn."""
-
-        self.busy = False
-        """A picture is on its way to the page."""
-
-        self.welcomed = False
-        """The page has the whole state; what changes is worth telling it."""
-
-        self.data: dict[str, Any] = {}
-        """What the answers remember of the page."""
-
-    @property
-    def author(self) -> str:
-        """Who did it, in the history."""
-        return str(self.id)
-
-    def send(self, message: messages.Outgoing) -> None:
-        """Send a message."""
-        self.send_text(messages.form(message))
-
-    def send_text(self, text: str) -> None:
-        """Send a message that was formed before."""
-        self._post(text)
-
-    def send_picture(self, data: bytes) -> None:
-        """Send a picture; no further one is drawn until it has gone out."""
-        self.busy = True
-        self._post(data)
-
-    def send_bytes(self, data: bytes) -> None:
-        """Send what belongs to a picture."""
-        self._post(data)
-
-
-class Job:
-    """Long work of a page; `step` is called between its parts."""
-
-    def __init__(self, client: Client, request: messages.JobRequest, worker: "Worker") -> None:
-        self.client = client
-        self.request = request
-        self.cancelled = False
-        self._worker = worker
-        self._breathing = False
-
-    @property
-    def id(self) -> int:
-        """The page's number of the job."""
-        return self.request.id
-
-    def step(self, done: int, total: int, text: str = "") -> None:
-        """Say how far the work is, and let the worker answer what is asked meanwhile.
-
-        Raises:
-            Cancelled: If the job was cancelled.
-        """
-        if self._breathing:  # what is answered meanwhile has steps, too
-            return
-        self.client.send(messages.Progress(id=self.id, done=done, total=total, text=text))
-        self._breathing = True
-        try:
-            self._worker.breathe()
-        finally:
-            self._breathing = False
-        if self.cancelled or self._worker.closing:
-            raise Cancelled
 
 
 class Answers(Protocol):
@@ -147,6 +70,10 @@ class Answers(Protocol):
         """A photograph as JPEG."""
         ...
 
+    def gaussians(self, version: int) -> Path:
+        """A PLY file of the Gaussians that are drawn."""
+        ...
+
     def close(self) -> None:
         """Save and release."""
         ...
@@ -174,6 +101,7 @@ class Worker:
         self._jobs: deque[Job] = deque()
         self._running: dict[tuple[int, int], Job] = {}
         self._hint: Client | None = None
+        self._answered = 0
         self.closing = False
         self._opened: Future[None] = Future()
         self._thread = threading.Thread(target=self._run, name="splatseg view: worker", daemon=True)
@@ -208,16 +136,19 @@ class Worker:
         if self._thread.ident is not None:
             self._thread.join()
 
-    def join(self, post: Callable[[str | bytes], None]) -> Client | None:
+    def join(
+        self, post: Callable[[str | bytes], None], stage: messages.Drawing = "server"
+    ) -> Client | None:
         """A page that comes; None where there are too many.
 
         Args:
             post: Sends it a message, from any thread.
+            stage: Who draws what it shows while the camera moves.
         """
         with self._changed:
             if len(self._clients) >= guard.MAX_CLIENTS or self.closing:
                 return None
-            client = Client(self._next_id, post)
+            client = Client(self._next_id, post, stage)
             self._next_id += 1
             self._clients[client.id] = client
             count = len(self._clients)
@@ -296,7 +227,7 @@ class Worker:
             raise InputError(f"job: expected a new number, got {message.id} again.")
         if sum(owner == client.id for owner, _ in self._running) >= _MAX_JOBS:
             raise InputError(f"job: at most {_MAX_JOBS} at a time; wait for one, or cancel it.")
-        job = Job(client, message, self)
+        job = Job(client, message, self.breathe)
         self._running[key] = job
         self._jobs.append(job)
 
@@ -337,8 +268,12 @@ class Worker:
             order = sorted(self._clients.values(), key=lambda client: client.author != author)
             self._clients = {client.id: client for client in order}
             for client in self._clients.values():
-                if client.camera is not None and client.waiting_camera is None:
+                waiting = client.waiting_camera
+                if client.camera is not None and waiting is None:
                     client.waiting_camera = _at_rest(client.camera)
+                elif waiting is not None and client.author == author:
+                    # A move that was looked at is made now, and not to be drawn twice.
+                    client.waiting_camera = msgspec.structs.replace(waiting, preview=None)
 
     def broadcast(self, message: messages.Outgoing) -> None:
         """Send a message to every page."""
@@ -358,15 +293,20 @@ class Worker:
                 answers.join(client)
         self.redraw()
 
-    def breathe(self) -> None:
-        """Answer what was asked while a job goes on: at most a picture and a message a page."""
+    def breathe(self) -> bool:
+        """Answer what was asked while a job goes on: at most a picture and a message a page.
+
+        Returns:
+            Whether the job goes on: the worker does not end.
+        """
         self._drawn.clear()
         for _ in range(2 * len(self.clients) + 2):
             with self._changed:
                 work = self._interactive()
             if work is None:
-                return
+                break
             work()
+        return not self.closing
 
     def end_job(self, job: Job, ending: messages.Finished | messages.Error) -> None:
         """Tell the page of the end of a job; from any thread."""
@@ -382,14 +322,9 @@ class Worker:
             client: The page.
             about: The gesture, job or command that the message is about.
         """
-        try:
-            work()
-        except SplatsegError as error:
-            client.send(messages.error_message(error, **about))
-        except Exception:  # noqa: BLE001  (other pages and the next message are not to suffer)
-            _log.exception("an answer failed")
-            text = "something is wrong in the server, which has written it to its output"
-            client.send(messages.Error(text=text, **about))  # pyright: ignore[reportArgumentType]
+        error = _tried(work, **about)
+        if error is not None:
+            client.send(error)
 
     def _run(self) -> None:
         # Torch's threads would spin on the cores that the kernels and the browser need.
@@ -473,6 +408,9 @@ class Worker:
     def _do_task(self, client: Client, message: messages.Incoming) -> None:
         work = self._of_answers().answer
         self.attempt(lambda: work(client, message), client, **about(message))
+        self._answered += 1
+        if self._answered % memory.EVERY == 0:
+            memory.give_back()
 
     def _do_call(self, work: Callable[[Any], Any], future: "Future[Any]") -> None:
         if not future.set_running_or_notify_cancel():
@@ -483,19 +421,15 @@ class Worker:
             future.set_exception(error)
 
     def _do_job(self, job: Job) -> None:
-        if job.cancelled:
-            self.end_job(job, messages.Error(text="cancelled", id=job.id))
-            return
-        try:
+        def run() -> None:
+            if job.cancelled:
+                raise Cancelled
             self._of_answers().run(job)
-        except Cancelled:
-            self.end_job(job, messages.Error(text="cancelled", id=job.id))
-        except SplatsegError as error:
-            self.end_job(job, messages.error_message(error, id=job.id))
-        except Exception:  # noqa: BLE001  (as above)
-            _log.exception("a job failed")
-            text = "something is wrong in the server, which has written it to its output"
-            self.end_job(job, messages.Error(text=text, id=job.id))
+
+        error = _tried(run, id=job.id)
+        if error is not None:
+            self.end_job(job, error)
+        memory.give_back()
 
     def _of_answers(self) -> Answers:
         if self._answers is None:
@@ -503,10 +437,24 @@ class Worker:
         return self._answers
 
 
-def _at_rest(request: messages.DrawRequest) -> messages.DrawRequest:
-    import msgspec
+def _tried(work: Work, **about: int | str | None) -> messages.Error | None:
+    """Do something; what is said of it where it fails."""
+    try:
+        work()
+    except Cancelled:
+        return messages.Error(text="cancelled", **about)  # pyright: ignore[reportArgumentType]
+    except SplatsegError as error:
+        return messages.error_message(error, **about)
+    except Exception:  # noqa: BLE001  (other pages and the next message are not to suffer)
+        _log.exception("an answer failed")
+        text = "something is wrong in the server, which has written it to its output"
+        return messages.Error(text=text, **about)  # pyright: ignore[reportArgumentType]
+    return None
 
-    return msgspec.structs.replace(request, rest=True)
+
+def _at_rest(request: messages.DrawRequest) -> messages.DrawRequest:
+    """The same camera at rest, of the document as it is."""
+    return msgspec.structs.replace(request, rest=True, preview=None)
 
 
 def about(message: messages.Incoming) -> dict[str, int | str | None]:

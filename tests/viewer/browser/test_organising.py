@@ -38,7 +38,13 @@ def test_keep(tab) -> None:
     tab.row("mug").wait_for()
     assert counts(tab) == {"mug": pytest.approx(EACH, abs=15)}
     assert tab.selection is None
+    sent = len(tab.sent)
+    tab.page.locator("#level").fill("1")
+    tab.pause(250)
+    assert "select" not in [one["type"] for one in tab.sent[sent:]], "what was kept is over"
+    tab.page.locator("#level").fill("0.5")
     tab.click(BLUE)
+    tab.page.locator("#overlay").focus()
     tab.after(lambda: tab.key("Enter"))
     assert set(counts(tab)) == {"mug", "Object 2"}
 
@@ -112,20 +118,9 @@ def test_hide(tab) -> None:
     assert not only(tab)["visible"]
 
 
-def reddest(tab) -> int:
+def reddest(tab, point=RED) -> int:
     """Red less blue in the middle of the red ball, of the picture."""
-    x, y = tab.at(RED)
-    box = tab.page.locator("#picture").bounding_box()
-    red, _, blue = tab.page.evaluate(
-        """([x, y]) => {
-            const one = new OffscreenCanvas(1, 1);
-            const g = one.getContext('2d', { willReadFrequently: true });
-            const picture = document.querySelector('#picture');
-            g.drawImage(picture, -Math.round(x * picture.width), -Math.round(y * picture.height));
-            return [...g.getImageData(0, 0, 1, 1).data.slice(0, 3)];
-        }""",
-        [(x - box["x"]) / box["width"], (y - box["y"]) / box["height"]],
-    )
+    red, _, blue = tab.colour(point)
     return red - blue
 
 
@@ -284,13 +279,98 @@ def test_move(tab) -> None:
     tab.until(lambda: tab.page.url != before)
 
 
-def exported(tab, kind: str, name: str, *, format: str | None = None) -> Path:
+def grip(tab) -> tuple[float, float]:
+    """The handle in the middle of what is selected, where the page was told that it is."""
+    return tab.at(tab.selection["centre"])
+
+
+def test_a_move_is_seen_while_a_handle_is_dragged(tab) -> None:
+    tab.click(RED)
+    tab.button("Move").click()
+    mouse, revision = tab.page.mouse, tab.serving.state()["document"]["revision"]
+    above = (RED[0], RED[1], 1.0)
+    assert reddest(tab) > 100
+    assert reddest(tab, above) < 50
+
+    def lift() -> tuple[float, float]:
+        (x, y), (_, up) = grip(tab), tab.at(above)
+        mouse.move(x, y)
+        mouse.down()
+        mouse.move(x, y - 20)
+        mouse.move(x, up, steps=3)
+        tab.until(lambda: reddest(tab, above) > 100, "the ball is where the handle is")
+        tab.until(lambda: reddest(tab) < 50, "and not where it was")
+        return x, up
+
+    lift()
+    assert tab.serving.state()["document"]["revision"] == revision
+    preview = tab.last("camera")["preview"]
+    assert preview["ids"] is None
+    assert preview["translation"][2] == pytest.approx(1.0, abs=0.2)
+    assert edits(tab) == []
+    tab.key("Escape")
+    tab.until(lambda: reddest(tab) > 100 and reddest(tab, above) < 50, "it is back")
+    assert "preview" not in tab.last("camera")
+    mouse.up()
+    assert edits(tab) == []
+    lift()
+    patch = tab.after(mouse.up)
+    assert patch["edits"] == [{"kind": "move", "count": patch["selection"]["count"]}]
+    assert patch["selection"]["centre"][2] == pytest.approx(1.0, abs=0.2)
+    tab.until(tab.quiet)
+    assert reddest(tab, above) > 100
+    start = len(tab.sent)
+    x, y = grip(tab)
+    tab.drag((x, y), (x + 60, y))
+    tab.until(lambda: edits(tab) == ["move", "move"], "the handles went with it")
+    asked = [one for one in tab.sent[start:] if one["type"] == "camera"]
+    assert all(one["preview"]["about"][2] > 0.7 for one in asked if "preview" in one)
+
+
+def test_objects_are_moved_by_their_handles(tab) -> None:
+    tab.keep(RED, "mug")
+    tab.pick("mug")
+    tab.after(lambda: tab.key("Control+Shift+A"), "selected", stage="final")
+    tab.page.locator("#overlay").focus()
+    tab.button("Scale").click()
+    centre = only(tab)["centre"]
+    x, y = tab.at(centre)
+    start = len(tab.sent)
+    tab.after(lambda: tab.drag((x + 78, y), (x + 100, y), (x + 156, y)))
+    previews = [one["preview"] for one in tab.sent[start:] if "preview" in one]
+    assert previews
+    assert previews[-1]["scale"] > 1.2
+    assert previews[-1]["ids"] == [only(tab)["id"]]
+    assert edits(tab) == ["move"]
+    assert only(tab)["radius"] > 0.5, "the list knows that it is larger"
+
+
+def test_clicks_follow_what_was_moved(tab) -> None:
+    tab.click(RED)
+    tab.button("Move").click()
+    x, y = grip(tab)
+    up = tab.at((RED[0], RED[1], 1.0))[1]
+    tab.after(lambda: tab.drag((x, y), (x, y - 20), (x, up)))
+    tab.key("c")
+    tab.after(lambda: tab.key("Control+Shift+A"), "selected", stage="final")
+    found = tab.click((RED[0], RED[1], 1.0))
+    assert found["count"] == pytest.approx(EACH, abs=15)
+    assert found["centre"] == pytest.approx((-1, 0, 1), abs=0.25)
+    tab.after(lambda: tab.press_at(RED), "error")
+    tab.after(tab.button("Remove from the scene").click)
+    tab.after(lambda: tab.press_at((RED[0], RED[1], 1.0), aside=(9, 0)), "error")
+    assert "sky" in tab.page.locator(".toast.bad").last.inner_text()
+
+
+def exported(tab, kind: str, name: str, *, format: str | None = None, which: str = "") -> Path:
     """What a kind of export makes, as it is downloaded."""
     page = tab.page
     tab.button("Export").click()
     page.locator(f"label[for=kind-{kind}]").click()
     if format is not None:
         page.locator("#export-format").select_option(format)
+    if which:
+        page.locator("#export-which").select_option(which)
     page.locator("#export-name").fill(name)
     link = page.locator(".toast .link")
     tab.after(page.locator("#export button[type=submit]").click, "finished")
@@ -304,10 +384,15 @@ def exported(tab, kind: str, name: str, *, format: str | None = None) -> Path:
 
 def test_export_and_look_at_the_file(tab) -> None:
     tab.keep(RED, "mug")
+    which, name = tab.page.locator("#export-which"), tab.page.locator("#export-name")
     tab.button("Export").click()
-    tab.page.locator("#export-which").select_option("picked")
+    assert which.input_value() == "all", "though what was kept last is picked"
+    assert name.input_value() == "balls"
+    which.select_option("picked")
+    assert name.input_value() == "mug"
     tab.button("Cancel", "#export").click()
-    path = exported(tab, "splat", "one", format="ply")
+    assert len(read_splats(exported(tab, "splat", "whole", format="ply"))) == 3 * EACH
+    path = exported(tab, "splat", "one", format="ply", which="picked")
     assert path.name == "one.ply"
     read = read_splats(path)
     assert len(read) == only(tab)["count"]
@@ -318,6 +403,7 @@ def test_export_and_look_at_the_file(tab) -> None:
     tab.pick("mug")
     tab.menu(MORE, "Export…")
     assert tab.page.locator("#kind-objects").is_checked()
+    assert which.input_value() == "picked", "as the menu of these says"
     tab.button("Close", "#export").click()
     assert not tab.page.locator("#export").is_visible()
 

@@ -1,10 +1,11 @@
 """Looking and selecting, as a person does it in the page."""
 
 import math
+from collections.abc import Iterator
 
 import pytest
 
-from support.browser import BLUE, GREEN, RED
+from support.browser import BLUE, GREEN, RED, Serving, Tab, write_worded_scene
 from support.viewer import EACH
 
 pytestmark = pytest.mark.browser
@@ -232,11 +233,23 @@ def test_sphere(tab) -> None:
     message = tab.last("select")
     assert message["kind"] == "sphere"
     assert message["radius"] > 0.5
-    x, y = tab.at(BLUE)
-    selection = tab.selecting(lambda: tab.drag((x, y), (x + 30, y)))
-    assert selection is not None
-    assert 1 <= selection["count"] < 0.9 * EACH
-    assert selection["centre"][0] > 0.5
+    assert len(message["points"]) == 1
+    tab.page.locator("#ball").fill("60")
+    (x, y), (left, _) = tab.at(BLUE), tab.at(RED)
+    part = tab.selecting(lambda: tab.page.mouse.click(x, y))
+    assert part is not None
+    assert 1 <= part["count"] < 0.9 * EACH
+    assert part["centre"][0] > 0.5
+    painted = tab.selecting(lambda: tab.drag((x, y - 70), (x, y), (x, y + 70)))
+    assert painted is not None
+    assert part["count"] < painted["count"] <= EACH
+    message = tab.last("select")
+    assert len(message["points"]) > 3, "a ball at each place of the way"
+    assert message["radius"] < 0.5
+    both = tab.selecting(lambda: tab.drag((x, y), (left, y)))
+    assert both is not None
+    assert abs(both["centre"][0]) < 0.9, "where nothing is, the brush leaves nothing"
+    assert len(tab.last("select")["points"]) > 10
 
 
 def test_no_words_here(tab) -> None:
@@ -264,16 +277,113 @@ def test_shapes_of_the_selection(tab) -> None:
     tab.after(lambda: tab.button("Fill holes").click(), "selected", stage="final")
 
 
-def test_more_like_this(tab) -> None:
+def test_more_like_this_where_nothing_is_known_of_it(tab) -> None:
     near(tab.click(RED), RED)
-    start = len(tab.heard)
-    tab.button("More like this").click()
-    tab.until(lambda: any(
-        m["type"] == "error" or (m["type"] == "selected" and m["stage"] == "final")
-        for m in tab.heard[start:]
-    ))  # fmt: skip
-    tab.until(tab.quiet)
+    near(tab.selecting(lambda: tab.button("More like this").click()), RED)
     assert tab.last("select")["kind"] == "similar"
+
+
+@pytest.fixture(scope="module")
+def worded_serving(chromium_path, tmp_path_factory) -> Iterator[Serving]:
+    """A server of balls that words find, two of which are alike."""
+    folder = tmp_path_factory.mktemp("words")
+    server = Serving(write_worded_scene(folder / "words"), folder / "server.log")
+    yield server
+    server.close()
+
+
+@pytest.fixture
+def worded(new_tab, worded_serving, request) -> Iterator[Tab]:
+    """A page of it."""
+    found = new_tab(worded_serving)
+    found.open()
+    yield found
+    worded_serving.clean()
+    found.check(request.node.originalname)
+
+
+def test_words(worded) -> None:
+    find = worded.page.locator("#find")
+    assert find.get_attribute("placeholder") == "Find: red mug"
+    worded.page.locator("#overlay").focus()
+    worded.key("/")
+    assert find.evaluate("field => field === document.activeElement")
+
+    def say(words: str, key: str = "Enter") -> dict | None:
+        find.fill(words)
+        return worded.selecting(lambda: find.press(key))
+
+    near(say("mug"), RED, BLUE)
+    near(say("plant"), GREEN)
+    assert say("mug", "Shift+Enter")["count"] == 3 * EACH
+    near(say("mug", "Control+Enter"), GREEN)
+    worded.after(lambda: find.fill("zebra") or find.press("Enter"), "error")
+    assert "zebra" in worded.page.locator(".toast.bad").inner_text()
+    near(worded.selection, GREEN)
+    say("mug")
+    worded.page.locator("label[for=mode-similarity]").click()
+    legend = worded.page.locator("#legend")
+    worded.until(legend.is_visible)
+    assert legend.get_attribute("aria-label").startswith("Similarity: from ")
+    worded.until(lambda: worded.colour(BLUE)[1] > worded.colour(GREEN)[1] + 30, "it is yellow")
+
+
+def test_more_like_this(worded) -> None:
+    near(worded.click(RED), RED)
+    near(worded.selecting(lambda: worded.button("More like this").click()), RED, BLUE)
+    near(worded.click(GREEN), GREEN)
+    near(worded.selecting(lambda: worded.button("More like this").click()), GREEN)
+
+
+def test_next_click(worded) -> None:
+    button = worded.button("Next click")
+    near(worded.click(RED), RED)
+    worded.until(lambda: worded.of("hint"), "a sure selection was looked at")
+    assert not button.is_visible()
+    near(worded.click(BLUE), BLUE)
+    worded.until(button.is_visible, "where the unsure one would be clicked next")
+    hint = worded.of("hint")[-1]
+    assert hint["view"] in ("first", "second")
+    before = worded.page.url
+    button.click()
+    worded.until(lambda: worded.page.url != before, "the camera goes to that photograph")
+    worded.page.locator("#overlay").press("Space")
+    worded.until(lambda: not button.is_visible(), "a click is made, the hint is over")
+
+
+def test_legends(tab) -> None:
+    legend = tab.page.locator("#legend")
+    assert not legend.is_visible()
+
+    def shown(mode: str) -> str:
+        tab.page.locator(f"label[for=mode-{mode}]").click()
+        tab.until(legend.is_visible)
+        return legend.get_attribute("aria-label")
+
+    assert shown("confidence") == "Confidence: from 0 % to 100 %"
+    assert (
+        legend.locator(".legend-bar")
+        .evaluate("bar => bar.style.backgroundImage")
+        .startswith("linear-gradient(to right, rgb(68, 1, 84),")
+    )
+    tab.page.locator("label[for=mode-objects]").click()
+    assert not legend.is_visible()
+    tab.page.locator("label[for=mode-depth]").click()
+    tab.until(lambda: (legend.get_attribute("aria-label") or "").startswith("Depth"))
+    label = legend.get_attribute("aria-label")
+    assert label.startswith("Depth, scene units: from 3.")
+    assert (
+        legend.locator(".legend-bar")
+        .evaluate("bar => bar.style.backgroundImage")
+        .startswith("linear-gradient(to right, rgb(253, 231, 37),")
+    )
+    # Nearer, the values are others.
+    middle = tab.at((0, 0, 0))
+    tab.page.mouse.move(*middle)
+    tab.page.mouse.wheel(0, -400)
+    tab.until(lambda: legend.get_attribute("aria-label") != label, "the ends follow the picture")
+    tab.page.locator("label[for=mode-colour]").click()
+    tab.until(legend.is_hidden)
 
 
 def test_all_none_invert_and_a_layer(tab) -> None:

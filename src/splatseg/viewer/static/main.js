@@ -7,6 +7,7 @@ import { Look, replaceFragment } from "./look.js";
 import { ExportDialog } from "./panels/export.js";
 import { HelpDialog } from "./panels/help.js";
 import { JobsPanel } from "./panels/jobs.js";
+import { Legend } from "./panels/legend.js";
 import { ObjectsPanel } from "./panels/objects.js";
 import { SelectionBar } from "./panels/selection.js";
 import { StatusLine } from "./panels/status.js";
@@ -16,6 +17,7 @@ import { ToolPanel } from "./panels/tools.js";
 import { TopBar } from "./panels/top.js";
 import { ViewsPanel } from "./panels/views.js";
 import { Socket, readFragment } from "./socket.js";
+import { GpuStage } from "./stage/gpu.js";
 import { ServerStage } from "./stage/server.js";
 import { Stage } from "./stage/stage.js";
 import { Store } from "./state.js";
@@ -45,10 +47,12 @@ export class App {
     this.camera = new Camera();
     this.socket = new Socket({
       message: (message) => this.receive(message),
-      frame: (data) => this.server.receive(data),
+      frame: (data) => this.drawing.receive(data),
       status: (status) => this.connection(status),
     });
     this.server = new ServerStage(this);
+    /** Whoever draws while the camera moves: the page, or the server. */
+    this.drawing = new GpuStage(this, this.server);
     this.gestures = new Gestures(this);
     this.tools = {
       click: new ClickTool(this),
@@ -74,6 +78,7 @@ export class App {
     this.toolPanel = new ToolPanel(this);
     this.top = new TopBar(this);
     this.status = new StatusLine(this);
+    this.legend = new Legend(this);
     /** @type {Map<number, (point: Vec3|null) => void>} */
     this.depths = new Map();
     this.depthCount = 0;
@@ -160,6 +165,10 @@ export class App {
         store.hint = message.view != null ? /** @type {any} */ (message) : null;
         store.changed("hint");
         break;
+      case "legend":
+        store.legend = /** @type {any} */ (message);
+        store.changed("legend");
+        break;
       case "progress":
         this.jobs.progress(/** @type {any} */ (message));
         break;
@@ -183,11 +192,12 @@ export class App {
       this.camera.up = unit(scene.up ?? [0, 0, 1]);
       if (!this.link || !this.camera.fromLink(this.link)) this.look.goHome();
       this.stage.resize();
+      this.drawing.choose(message.stage);
     }
     if (!scene.modes.includes(this.store.mode)) this.store.mode = scene.modes[0] ?? "colour";
     this.store.changed("mode");
     this.waiting = 0;
-    this.server.reset();
+    this.drawing.reset();
   }
 
   /** @param {import("./state.js").PatchMessage} message */
@@ -228,6 +238,7 @@ export class App {
     if (id != null && this.jobs.failed({ id, text, fix })) return;
     if (command) this.waiting = Math.max(0, this.waiting - 1);
     if (command === "keep") this.keeping = false;
+    if (command === "move") this.tools.move.refused();
     if (gesture != null) {
       const depth = this.depths.get(gesture);
       this.depths.delete(gesture);
@@ -327,7 +338,7 @@ export class App {
     if (store.mode !== "colour") store.previousMode = store.mode;
     store.mode = mode;
     store.changed("mode");
-    this.server.rest();
+    this.drawing.rest();
   }
 
   toggleOverlay() {
@@ -343,7 +354,7 @@ export class App {
   setOnly(id) {
     this.store.only = id;
     this.store.changed("mode");
-    this.server.rest();
+    this.drawing.rest();
   }
 
   /** Brush or radius. @param {number} factor */
@@ -386,6 +397,8 @@ export class App {
     let count = this.store.document.objects.length + 1;
     while (names.has(`Object ${count}`)) count += 1;
     this.keeping = this.command("keep", { name: name || `Object ${count}` });
+    // The prompt is over: its points go, and the level is of the next one.
+    if (this.keeping) this.gestures.forget();
   }
 
   enter() {
@@ -433,13 +446,14 @@ export class App {
    * @param {"remove"|"duplicate"|"move"} kind
    * @param {import("./tools/move.js").Motion} [motion]
    * @param {number[]} [ids]
+   * @returns {boolean} Whether it went out.
    */
   edit(kind, motion, ids) {
     const { store, camera } = this;
     const objects = ids ?? (store.document.selection ? undefined : [...store.picked]);
     if (objects?.length === 0) {
       this.toast("Nothing is selected.", "Select a thing or pick an object in the list.");
-      return;
+      return false;
     }
     /** @type {Record<string, unknown>} */
     const args = objects ? { ids: objects } : {};
@@ -449,7 +463,7 @@ export class App {
       args.translation = mul(camera.right, (subject.radius || camera.radius * 0.05) * 1.5);
       args.about = subject.about;
     }
-    this.command(kind, args);
+    return this.command(kind, args);
   }
 
   /** @param {string} colour #rrggbb */

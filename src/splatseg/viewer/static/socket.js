@@ -19,6 +19,8 @@ export class Socket {
     this.embedded = new URLSearchParams(location.search).has("embed");
     /** @type {string|null} */
     this.token = null;
+    /** Who draws while the camera moves. @type {"server"|"gpu"} */
+    this.stage = "server";
     /** @type {WebSocket|null} */
     this.socket = null;
     this.wait = FIRST_WAIT;
@@ -54,11 +56,8 @@ export class Socket {
     let opened = false;
     socket.onopen = () => {
       opened = true;
-      this.send(
-        this.token
-          ? { type: "hello", version: 1, token: this.token }
-          : { type: "hello", version: 1 },
-      );
+      const token = this.token ? { token: this.token } : {};
+      this.send({ type: "hello", version: 1, stage: this.stage, ...token });
     };
     socket.onmessage = (event) => {
       if (typeof event.data !== "string") {
@@ -129,6 +128,12 @@ export class Socket {
     return true;
   }
 
+  /** What is at a path of the server. @param {string} path @returns {Promise<Response>} */
+  fetch(path) {
+    const headers = this.token ? { Authorization: `Bearer ${this.token}` } : undefined;
+    return fetch(path, { headers });
+  }
+
   /**
    * Address for an image or a download; with a token in memory, fetched into a blob.
    * @param {string} path
@@ -136,7 +141,7 @@ export class Socket {
    */
   async address(path) {
     if (!this.token) return path;
-    const answer = await fetch(path, { headers: { Authorization: `Bearer ${this.token}` } });
+    const answer = await this.fetch(path);
     if (!answer.ok) throw new Error(`${path}: ${answer.status}`);
     return URL.createObjectURL(await answer.blob());
   }

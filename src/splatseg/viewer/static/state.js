@@ -15,22 +15,26 @@
  * @typedef {{name: string, matrix: number[], width: number, height: number, fx: number, fy: number,
  *   cx: number, cy: number, split: string, photograph: boolean}} SceneView
  * @typedef {{name: string, count: number, up: Vec3|null, centre: Vec3, radius: number,
- *   home: {matrix: number[], focal: number, width: number, height: number}}} SceneFacts
+ *   home: {matrix: number[], focal: number, width: number, height: number}, low_pass: number,
+ *   antialiased: boolean}} SceneFacts
  * @typedef {SceneFacts & {views: SceneView[], layers: string[], source: string|null,
  *   words: boolean, modes: string[]}} SceneInfo
  * @typedef {{type: "state", version: number, scene: SceneFacts, views: SceneView[],
  *   layers: string[], source: string|null, words: boolean, modes: string[], document: Document,
  *   undo: string|null, redo: string|null, clients: number, me: string|number, ready?: boolean,
- *   fitting?: {steps: number, progress: number}|null, features?: string[]}} StateMessage
+ *   fitting?: {steps: number, progress: number}|null, features?: string[], ramp?: string[],
+ *   stage: "server"|"gpu"}} StateMessage
  * @typedef {{type: "patch", from: number, to: number, objects?: SceneObject[]|null,
  *   gone?: number[]|null, order?: number[]|null, suggestions?: Suggestion[]|null,
  *   selection?: SelectionInfo|null, edits?: EditInfo[]|null, isolated?: number[]|null,
  *   undo: string|null,
  *   redo: string|null, author: string|number}} PatchMessage
+ * @typedef {{mode: string, ends: [number, number]|null}} LegendMessage Values at the first and at
+ *   the last colour of the ramp.
  * @typedef {"click"|"box"|"stroke"|"lasso"|"polygon"|"sphere"|"move"} ToolId
  * @typedef {"set"|"add"|"remove"|"intersect"} SelectMode
  * @typedef {"scene"|"document"|"selection"|"picked"|"mode"|"tool"|"selectMode"|"level"|"hover"|
- *   "status"|"connection"|"compare"|"hint"} Topic
+ *   "status"|"connection"|"compare"|"hint"|"legend"} Topic
  */
 
 /** @type {Document} */
@@ -57,6 +61,10 @@ export class Store {
     this.fitting = null;
     /** @type {Set<string>} */
     this.features = new Set();
+    /** Colours that values are drawn in. @type {string[]} */
+    this.ramp = [];
+    /** What they stand for in the last picture at rest. @type {LegendMessage|null} */
+    this.legend = null;
     /** @type {"connecting"|"open"|"lost"|"refused"|"full"} */
     this.connection = "connecting";
     this.mode = "colour";
@@ -130,10 +138,12 @@ export class Store {
     this.ready = message.ready ?? true;
     this.fitting = message.fitting ?? null;
     this.features = new Set(message.features ?? []);
+    this.ramp = message.ramp ?? [];
+    this.legend = null;
     this.selected = null;
     this.hint = null;
     this.setDocument(message.document);
-    this.changed("scene", "document", "selection", "picked", "status", "hint");
+    this.changed("scene", "document", "selection", "picked", "status", "hint", "legend");
   }
 
   /**

@@ -13,7 +13,7 @@ const NAME = "[A-Za-z0-9][A-Za-z0-9._\\-]{0,59}";
 
 /** @type {[string, string][]} */
 const SPLATS = [
-  ["ply", "PLY, exact, with labels as columns"],
+  ["ply", "PLY, exact, with labels"],
   ["compressed.ply", "Compressed PLY"],
   ["splat", ".splat"],
   ["spz", "SPZ"],
@@ -102,13 +102,17 @@ export class ExportDialog {
     /** @type {Kind} */
     this.kind = KINDS[0];
     this.format = "ply";
+    /** Whether the picked objects alone are exported: what was kept last is picked, so not by
+     * default. */
+    this.picked = false;
     this.dialog.addEventListener("click", (event) => {
       if (event.target === this.dialog) this.dialog.close();
     });
   }
 
-  /** @param {string} [kind] */
-  open(kind = "splat") {
+  /** @param {string} [kind] @param {boolean} [picked] Of the picked objects alone. */
+  open(kind = "splat", picked = false) {
+    this.picked = picked && this.app.store.picked.size > 0;
     this.kind = KINDS.find((item) => item.id === kind) ?? KINDS[0];
     this.build();
     this.dialog.showModal();
@@ -226,7 +230,14 @@ export class ExportDialog {
     select.append(el("option", { value: "all", text: all }));
     const text =
       picked === 1 ? `Only ${store.pickedObjects()[0].name}` : `Only the ${picked} picked objects`;
-    if (picked > 0) select.append(el("option", { value: "picked", text, selected: true }));
+    if (picked > 0) select.append(el("option", { value: "picked", text, selected: this.picked }));
+    select.addEventListener("change", () => {
+      this.picked = select.value === "picked";
+      const name = this.dialog.querySelector("#export-name");
+      if (name instanceof HTMLInputElement && this.kind.id === "splat") {
+        name.value = this.defaultName();
+      }
+    });
     return el(
       "label",
       { class: "form-row", for: "export-which" },
@@ -252,7 +263,7 @@ export class ExportDialog {
   defaultName() {
     const { store } = this.app;
     const scene = store.scene?.name ?? "scene";
-    const one = store.picked.size === 1 ? store.pickedObjects()[0].name : null;
+    const one = this.picked && store.picked.size === 1 ? store.pickedObjects()[0].name : null;
     if (this.kind.id !== "splat") return this.kind.file;
     const plain = (one ?? scene).normalize("NFKD").replaceAll(/[^A-Za-z0-9._-]+/g, "-");
     return plain.replace(/^[-._]+|[-._]+$/g, "").slice(0, 60) || "scene";

@@ -283,7 +283,7 @@ export class ObjectsPanel {
         key: "Del",
         action: () => app.edit("remove", undefined, ids),
       },
-      { label: "Export…", icon: "export", action: () => app.exportDialog.open("objects") },
+      { label: "Export…", icon: "export", action: () => app.exportDialog.open("objects", true) },
     ]);
   }
 

@@ -14,7 +14,7 @@ export class StatusLine {
     this.count = el("span", {});
     this.size = el("span", { class: "wide" });
     this.times = el("span", { class: "wide" });
-    this.draws = el("span", { class: "wide", text: "server draws" });
+    this.draws = el("span", { class: "wide" });
     this.edits = el("span", { class: "wide" });
     this.saved = el("span", {});
     this.people = el("span", {});
@@ -33,7 +33,7 @@ export class StatusLine {
   }
 
   show() {
-    const { store, stage } = this.app;
+    const { store, stage, drawing } = this.app;
     const { frame, scene, selected } = store;
     const open = store.connection === "open";
     this.says.textContent = stage.tool.says;
@@ -48,6 +48,7 @@ export class StatusLine {
     this.times.textContent = times.join("  ");
     const stages = Object.entries(selected?.stages ?? {});
     this.times.title = stages.map(([name, ms]) => `${name} ${ms.toFixed(0)} ms`).join(", ");
+    this.draws.textContent = drawing.says;
     const edits = store.document.edits.length;
     this.edits.textContent = edits > 0 ? counted(edits, "edit") : "";
     this.saved.textContent = open ? "saved" : "";

@@ -164,6 +164,25 @@ export class TopBar {
     localStorage.setItem("splatseg-theme", known);
   }
 
+  /** Who draws while the camera moves. @returns {import("./menu.js").Item[]} */
+  drawers() {
+    const { drawing } = this.app;
+    /** @type {[import("../stage/choice.js").Wanted, string][]} */
+    const drawers = [
+      ["server", "By the server"],
+      ["gpu", "In the page, on its GPU"],
+    ];
+    // Against the page's own judgement.
+    if (drawing.reason || drawing.wanted === "forced") {
+      drawers.push(["forced", "In the page, however slow"]);
+    }
+    return drawers.map(([wanted, label]) => ({
+      label,
+      checked: drawing.wanted === wanted,
+      action: () => drawing.choose(wanted),
+    }));
+  }
+
   /** @param {HTMLElement} button */
   settings(button) {
     const { app } = this;
@@ -203,6 +222,8 @@ export class TopBar {
         checked: same(item.up),
         action: () => app.look.setUp(item.up),
       })),
+      { title: "Drawing" },
+      ...this.drawers(),
       { title: "Keys" },
       {
         label: "Keys of one letter",

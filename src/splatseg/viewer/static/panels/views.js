@@ -105,7 +105,7 @@ export class ViewsPanel {
       this.watcher.unobserve(target);
       const name = target.dataset.view ?? "";
       const image = target.querySelector("img");
-      if (!image || !this.app.store.view(name)?.photograph) continue;
+      if (!image) continue; // a view without a photograph is drawn
       void this.app.socket
         .address(`/photographs/${encodeURIComponent(name)}?width=${THUMBNAIL}`)
         .then((address) => {

@@ -8,6 +8,9 @@ import { outline } from "./outline.js";
  * @typedef {import("../state.js").Vec3} Vec3
  */
 
+/** Canvas whose width the options of a tool take, CSS pixels. */
+const NARROW = 480;
+
 /** Everything over the picture. @param {App} app */
 export function drawOverlay(app) {
   const { store, stage } = app;
@@ -66,7 +69,9 @@ function drawPivot({ stage, camera }, g) {
  * @param {CanvasRenderingContext2D} g */
 function drawAxes({ stage, camera }, g) {
   const size = 20;
-  const at = { x: stage.box.clientWidth - size - 18, y: size + 18 };
+  const { clientWidth: width } = stage.box;
+  // On a narrow page below the options of the tool, which are as wide.
+  const at = { x: width - size - 18, y: size + (width < NARROW ? 62 : 18) };
   /** @type {{name: string, x: number, y: number, depth: number, colour: string}[]} */
   const axes = [];
   const world = /** @type {const} */ ([
@@ -131,6 +136,25 @@ function cross(g, x, y) {
     g.moveTo(x, y - 9);
     g.lineTo(x, y + 9);
     g.stroke();
+  }
+}
+
+/**
+ * The way of a brush, seen on dark, light and selected things.
+ * @param {CanvasRenderingContext2D} g @param {readonly {x: number, y: number}[]} points
+ * @param {number} width
+ */
+export function trail(g, points, width) {
+  const path = new Path2D();
+  path.moveTo(points[0].x, points[0].y);
+  for (const { x, y } of points) path.lineTo(x, y);
+  for (const [colour, wide] of /** @type {const} */ ([
+    ["rgb(0 0 0 / 0.4)", width + 3],
+    ["rgb(255 255 255 / 0.5)", width],
+  ])) {
+    g.strokeStyle = colour;
+    g.lineWidth = wide;
+    g.stroke(path);
   }
 }
 

@@ -2,6 +2,8 @@
  * Pictures drawn by the server: newest camera wins, one frame in flight, a still at rest.
  */
 
+import { unpacked } from "./binary.js";
+
 /** @typedef {import("../main.js").App} App */
 
 const REST_AFTER = 180;
@@ -27,18 +29,32 @@ export class ServerStage {
     this.measures = 0;
     /** @type {Uint8Array|null} */
     this.lastFrame = null;
+    /** Called when the picture at rest of where the camera is has been painted. */
+    this.still = () => {};
   }
 
   /** The camera moved. */
   moved() {
     this.ask(false);
+    this.restLater();
+  }
+
+  /** A still, once the camera has not moved for a while. */
+  restLater() {
     clearTimeout(this.restTimer);
-    this.restTimer = setTimeout(() => this.ask(true), REST_AFTER);
+    this.restTimer = setTimeout(() => this.rest(), REST_AFTER);
+  }
+
+  /** Nothing more of a move under way: it is made now, and the change is drawn by itself. */
+  hold() {
+    clearTimeout(this.restTimer);
+    this.wanted = false;
   }
 
   /** A still, now. */
   rest() {
     clearTimeout(this.restTimer);
+    this.restTimer = 0;
     this.ask(true);
   }
 
@@ -59,6 +75,7 @@ export class ServerStage {
     const { store, camera, stage } = this.app;
     // What moves is drawn in CSS pixels: four times as many on a fine screen would be for nobody.
     const scale = rest ? 1 : 1 / stage.ratio;
+    const preview = this.app.tools.move.preview();
     const id = this.id + 1;
     const sent = this.app.send({
       type: "camera",
@@ -67,7 +84,8 @@ export class ServerStage {
       mode: store.mode,
       only: store.only,
       rest,
-      ids: rest,
+      ids: rest && !preview,
+      ...(preview ? { preview } : {}),
     });
     if (!sent) return;
     this.id = id;
@@ -116,6 +134,8 @@ export class ServerStage {
     }
     this.painted = order;
     this.app.stage.paint(bitmap);
+    const rest = view.getUint8(17) === 1;
+    if (rest && id === this.id && !this.restTimer) this.still();
     const now = performance.now();
     const { store } = this.app;
     store.frame = {
@@ -127,7 +147,7 @@ export class ServerStage {
       whole: start === undefined ? (store.frame?.whole ?? 0) : now - start,
     };
     bitmap.close();
-    if (start !== undefined) this.measure(start, now, view.getUint8(17) === 1);
+    if (start !== undefined) this.measure(start, now, rest);
     store.changed("status");
   }
 
@@ -146,11 +166,9 @@ export class ServerStage {
     const id = view.getUint32(1, true);
     const width = view.getUint16(5, true);
     const height = view.getUint16(7, true);
-    const packed = new Blob([new Uint8Array(data, 9)]).stream();
-    const plain = packed.pipeThrough(new DecompressionStream("deflate"));
     let ids;
     try {
-      ids = new Uint16Array(await new Response(plain).arrayBuffer());
+      ids = new Uint16Array(await unpacked(data, 9));
     } catch {
       return;
     }

@@ -26,6 +26,8 @@ const LOOK_SPEED = 0.004;
 const WHEEL_SPEED = 0.0012;
 const SWING = 260;
 const LONGEST_SIDE = 2560;
+/** Tools that select the thing under the pointer. */
+const POINTING = ["click", "box", "stroke"];
 
 export class Stage {
   /** @param {App} app */
@@ -151,7 +153,7 @@ export class Stage {
     this.outlines.clear();
     this.setHover(0);
     this.photograph.check();
-    this.app.server.moved();
+    this.app.drawing.moved();
     this.app.look.remember();
     this.redraw();
   }
@@ -251,7 +253,10 @@ export class Stage {
       moved: false,
       tool,
     };
-    if (tool) this.redraw();
+    if (tool) {
+      this.setHover(0);
+      this.redraw();
+    }
   }
 
   /** @param {PointerEvent} event */
@@ -427,7 +432,8 @@ export class Stage {
 
   /** What the id map has at a point: no message. @param {Point|null} point */
   hoverAt(point) {
-    const busy = this.drag !== null || this.app.store.tool === "move";
+    // Outlines say what a click means; what is drawn around things does not go by them.
+    const busy = this.drag !== null || !POINTING.includes(this.app.store.tool);
     if (!point || point.touch || busy || !this.ids) {
       this.setHover(0);
       return;

@@ -34,7 +34,12 @@ export class MoveTool {
     this.kind = "translate";
     /** @type {{axis: number, from: Point, about: Vec3, motion: Motion}|null} */
     this.grip = null;
+    /** What was let go of, until the document says so. @type {Motion|null} */
+    this.sent = null;
     this.near = NONE;
+    app.store.on(["document", "connection"], () => {
+      this.sent = null;
+    });
   }
 
   get says() {
@@ -57,6 +62,13 @@ export class MoveTool {
       return { about, radius };
     }
     return selection ? { about: this.app.camera.pivot, radius: 0 } : null;
+  }
+
+  /** A move under way, as the picture is to show it. */
+  preview() {
+    const { store } = this.app;
+    if (!this.grip || !store.features.has("preview")) return null;
+    return { ids: store.document.selection ? null : [...store.picked], ...this.grip.motion };
   }
 
   /** Scene units a CSS pixel at a point. @param {Vec3} about @returns {number} */
@@ -120,8 +132,7 @@ export class MoveTool {
     const { grip } = this;
     if (!grip) return;
     grip.motion = this.motion(point);
-    const { app } = this;
-    if (app.store.features.has("preview")) app.server.moved();
+    this.app.server.moved();
   }
 
   /** What a drag to a point means. @param {Point} point @returns {Motion} */
@@ -162,15 +173,23 @@ export class MoveTool {
     if (!this.grip) return;
     const motion = this.motion(point);
     this.grip = null;
-    this.commit(motion);
+    this.app.server.hold();
+    if (this.commit(motion)) this.sent = motion;
+    else this.app.server.rest();
   }
 
-  /** @param {Motion} motion */
+  /** Make a move. @param {Motion} motion @returns {boolean} Whether there is one. */
   commit(motion) {
     const turned = Math.abs(motion.rotation[0]) < 1 - 1e-9;
     const shifted = motion.translation.some((value) => Math.abs(value) > 1e-9);
-    if (!turned && !shifted && Math.abs(motion.scale - 1) < 1e-6) return;
-    this.app.edit("move", motion);
+    if (!turned && !shifted && Math.abs(motion.scale - 1) < 1e-6) return false;
+    return this.app.edit("move", motion);
+  }
+
+  /** The server did not make the move. */
+  refused() {
+    this.sent = null;
+    this.app.server.rest();
   }
 
   /** Steps by arrow keys; Shift: by depth. @param {number} x @param {number} y @returns {boolean} */
@@ -205,6 +224,7 @@ export class MoveTool {
   cancel() {
     const had = this.grip !== null;
     this.grip = null;
+    if (had) this.app.server.rest();
     return had;
   }
 
@@ -213,17 +233,21 @@ export class MoveTool {
     const subject = this.subject();
     if (!subject) return;
     const { stage } = this.app;
-    const motion = this.grip?.motion;
+    const motion = this.grip?.motion ?? this.sent;
     const about = motion ? add(subject.about, motion.translation) : subject.about;
     const middle = stage.css(about);
     if (middle.depth <= 0) return;
-    if (motion && subject.radius > 0) this.drawGhost(g, subject, motion);
+    const right = stage.box.clientWidth;
+    const { features } = this.app.store;
+    if (motion && subject.radius > 0 && !features.has("preview")) {
+      this.drawGhost(g, subject, motion);
+    }
     if (this.kind === "scale") {
       const factor = motion?.scale ?? 1;
       const path = new Path2D();
       path.arc(middle.x, middle.y, LENGTH * factor, 0, 2 * Math.PI);
       stroke(g, path, this.near === FREE || motion ? "#ffffff" : this.app.accent, 2.5);
-      if (motion) label(g, middle.x, middle.y, `× ${factor.toFixed(2)}`);
+      if (motion) label(g, middle.x, middle.y, `× ${factor.toFixed(2)}`, right);
       return;
     }
     for (const [index, line] of this.lines(about).entries()) {
@@ -247,9 +271,10 @@ export class MoveTool {
     }
     if (motion && this.kind === "rotate") {
       const angle = (2 * Math.acos(Math.min(1, Math.abs(motion.rotation[0]))) * 180) / Math.PI;
-      label(g, middle.x, middle.y, `${angle.toFixed(0)}°`);
+      label(g, middle.x, middle.y, `${angle.toFixed(0)}°`, right);
     } else if (motion) {
-      label(g, middle.x, middle.y, motion.translation.map((part) => part.toFixed(2)).join("  "));
+      const parts = motion.translation.map((part) => part.toFixed(2));
+      label(g, middle.x, middle.y, parts.join("  "), right);
     }
   }
 
@@ -353,16 +378,19 @@ function arrowHead(g, from, to, colour) {
   g.restore();
 }
 
-/** @param {CanvasRenderingContext2D} g @param {number} x @param {number} y @param {string} text */
-function label(g, x, y, text) {
+/** Words beside a handle, within the canvas. @param {CanvasRenderingContext2D} g
+ * @param {number} x @param {number} y @param {string} text @param {number} right Edge. */
+function label(g, x, y, text, right) {
   g.font = "600 12px system-ui, 'DejaVu Sans', sans-serif";
   const width = g.measureText(text).width + 14;
+  const left = Math.max(4, Math.min(x + 14, right - width - 4));
+  const top = Math.max(4, y - 34);
   g.fillStyle = "rgb(16 18 22 / 0.82)";
   g.beginPath();
-  g.roundRect(x + 14, y - 34, width, 22, 6);
+  g.roundRect(left, top, width, 22, 6);
   g.fill();
   g.fillStyle = "#ffffff";
   g.textBaseline = "middle";
   g.textAlign = "left";
-  g.fillText(text, x + 21, y - 22.5);
+  g.fillText(text, left + 7, top + 11.5);
 }

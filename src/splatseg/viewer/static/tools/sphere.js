@@ -1,29 +1,32 @@
-/** Sphere: a ball around a point of the surface; the drag says how large. */
+/** Sphere: a brush that takes what is in balls on a surface. */
 
-import { sketch } from "../stage/overlay.js";
 import { clamp } from "../dom.js";
+import { sketch, trail } from "../stage/overlay.js";
 
 /**
  * @typedef {import("../main.js").App} App
  * @typedef {import("../state.js").Vec3} Vec3
  * @typedef {import("../stage/stage.js").Tool} Tool
  * @typedef {import("../stage/stage.js").Point} Point
+ * @typedef {{points: Point[], world: Vec3|null|undefined, ended: Point|null}} Press `world`: of the
+ *   first point, null where nothing is, undefined until the server has said it.
  */
 
-const DRAGGED = 5;
+/** Between two balls, as a share of their radius. */
+const APART = 0.35;
+const MOST_POINTS = 400;
 
 /** @implements {Tool} */
 export class SphereTool {
   cursor = "crosshair";
-  says =
-    "Press on a surface and drag for the radius; a click takes the last one. [ and ] change it.";
+  says = "Paint with a ball on a surface. [ and ] change its radius.";
 
   /** @param {App} app */
   constructor(app) {
     this.app = app;
-    /** Of a click, CSS pixels. */
+    /** At the depth where the stroke begins, CSS pixels. */
     this.radius = 40;
-    /** @type {{from: Point, to: Point, world: Vec3|null|undefined, done: boolean}|null} */
+    /** @type {Press|null} */
     this.press = null;
     /** @type {Point|null} */
     this.at = null;
@@ -37,20 +40,32 @@ export class SphereTool {
 
   /** @param {Point} point @returns {boolean} */
   down(point) {
-    /** @type {{from: Point, to: Point, world: Vec3|null|undefined, done: boolean}} */
-    const press = { from: point, to: point, world: undefined, done: false };
+    /** @type {Press} */
+    const press = { points: [point], world: undefined, ended: null };
     this.press = press;
+    this.at = point;
     this.app.depth(this.app.stage.pixel(point), (world) => {
       press.world = world;
-      if (press.done) this.send(press);
+      if (press.ended) this.send(press, press.ended);
     });
     return true;
   }
 
   /** @param {Point} point */
   move(point) {
-    if (this.press) this.press.to = point;
     this.at = point;
+    const points = this.press?.points;
+    const apart = Math.max(2, APART * this.radius);
+    // A quick pointer skips pixels; the brush goes all the way.
+    while (points && points.length < MOST_POINTS) {
+      const last = points[points.length - 1];
+      const away = Math.hypot(point.x - last.x, point.y - last.y);
+      if (away < apart) return;
+      const share = apart / away;
+      const x = last.x + share * (point.x - last.x);
+      const y = last.y + share * (point.y - last.y);
+      points.push({ ...point, x, y });
+    }
   }
 
   /** @param {Point} point */
@@ -58,25 +73,25 @@ export class SphereTool {
     const { press } = this;
     this.press = null;
     if (!press) return;
-    press.to = point;
-    press.done = true;
-    const dragged = Math.hypot(point.x - press.from.x, point.y - press.from.y);
-    if (dragged >= DRAGGED) this.setRadius(dragged);
-    if (press.world !== undefined) this.send(press);
+    press.ended = point;
+    if (press.world !== undefined) this.send(press, point);
   }
 
-  /** @param {{from: Point, to: Point, world: Vec3|null|undefined}} press */
-  send({ from, to, world }) {
+  /** @param {Press} press @param {Point} ended */
+  send({ points, world }, ended) {
     const { camera, gestures, stage } = this.app;
     if (!world) {
       this.app.toast("There is no surface at that point.", "Press on a thing.");
       return;
     }
-    const depth = camera.project(world).depth;
-    const radius = (this.radius * stage.ratio * depth) / camera.pixels;
+    const radius = (this.radius * stage.ratio * camera.project(world).depth) / camera.pixels;
     gestures.begin(
-      { kind: "sphere", points: [stage.pixel(from)], radius: Number(radius.toPrecision(6)) },
-      { mode: gestures.modeOf(to) },
+      {
+        kind: "sphere",
+        points: points.map((at) => stage.pixel(at)),
+        radius: Number(radius.toPrecision(6)),
+      },
+      { mode: gestures.modeOf(ended) },
     );
   }
 
@@ -95,17 +110,15 @@ export class SphereTool {
 
   /** @param {CanvasRenderingContext2D} g */
   draw(g) {
-    const centre = this.press?.from ?? this.at;
-    if (!centre) return;
-    const { press } = this;
-    const dragged = press ? Math.hypot(press.to.x - press.from.x, press.to.y - press.from.y) : 0;
-    const radius = dragged >= DRAGGED ? dragged : this.radius;
+    const { press, radius } = this;
+    if (press) trail(g, press.points, 2 * radius);
+    if (!this.at) return;
     const path = new Path2D();
-    path.arc(centre.x, centre.y, radius, 0, 2 * Math.PI);
-    sketch(g, path, this.app.accent, press !== null);
+    path.arc(this.at.x, this.at.y, radius, 0, 2 * Math.PI);
+    sketch(g, path, this.app.accent, false);
     g.globalAlpha = 0.7;
     const waist = new Path2D();
-    waist.ellipse(centre.x, centre.y, radius, radius * 0.3, 0, 0, Math.PI);
+    waist.ellipse(this.at.x, this.at.y, radius, radius * 0.3, 0, 0, Math.PI);
     g.strokeStyle = "#ffffff";
     g.lineWidth = 1;
     g.stroke(waist);

@@ -7,6 +7,7 @@
  */
 
 import { clamp } from "../dom.js";
+import { trail } from "../stage/overlay.js";
 
 const APART = 3;
 const MOST_POINTS = 1500;
@@ -80,16 +81,7 @@ export class StrokeTool {
 
   /** @param {CanvasRenderingContext2D} g */
   draw(g) {
-    if (this.points.length > 0) {
-      const path = new Path2D();
-      path.moveTo(this.points[0].x, this.points[0].y);
-      for (const { x, y } of this.points) path.lineTo(x, y);
-      g.globalAlpha = 0.45;
-      g.strokeStyle = this.app.accent;
-      g.lineWidth = this.width;
-      g.stroke(path);
-      g.globalAlpha = 1;
-    }
+    if (this.points.length > 0) trail(g, this.points, this.width);
     if (!this.at) return;
     for (const [colour, width] of /** @type {const} */ ([
       ["rgb(0 0 0 / .6)", 3],
