@@ -469,8 +469,11 @@ def test_a_page_that_reads_no_more_is_let_go(server, monkeypatch) -> None:
     monkeypatch.setattr(_server, "_MAX_WAITING", 15)  # who reads may be late on a busy machine
     with opened(server), opened(server) as other:
         before = len(server.worker.clients)
-        for _ in range(40):
-            server.worker.broadcast(messages.Error(text="x" * 1_000_000))
+        told = messages.Error(text="x" * 1_000_000)
+        # In the worker's thread, as all is: so both pages are welcomed by then. What buffers of the
+        # system and of the library for clients hold, up to some 30 messages, does not wait.
+        for _ in range(80):
+            server.worker.call(lambda _: server.worker.broadcast(told)).result()
             other.next("error")
         while len(server.worker.clients) == before:
             time.sleep(0.01)
