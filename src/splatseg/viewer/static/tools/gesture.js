@@ -8,6 +8,19 @@
  *   width?: number, radius?: number, text?: string}} Prompt
  */
 
+const APART = 3;
+const MOST_POINTS = 1500;
+
+/**
+ * Go on with a line that a pointer draws: a point where it is far enough from the last one.
+ * @param {Point[]} points @param {Point} point
+ */
+export function follow(points, point) {
+  const last = points.at(-1);
+  if (!last || points.length >= MOST_POINTS) return;
+  if (Math.hypot(point.x - last.x, point.y - last.y) >= APART) points.push(point);
+}
+
 export class Gestures {
   /** @param {App} app */
   constructor(app) {

@@ -1,15 +1,13 @@
 /** Lasso: draw around a thing. */
 
 import { sketch } from "../stage/overlay.js";
+import { follow } from "./gesture.js";
 
 /**
  * @typedef {import("../main.js").App} App
  * @typedef {import("../stage/stage.js").Tool} Tool
  * @typedef {import("../stage/stage.js").Point} Point
  */
-
-const APART = 3;
-const MOST_POINTS = 1500;
 
 /** @implements {Tool} */
 export class LassoTool {
@@ -31,9 +29,7 @@ export class LassoTool {
 
   /** @param {Point} point */
   move(point) {
-    const last = this.points.at(-1);
-    if (!last || this.points.length >= MOST_POINTS) return;
-    if (Math.hypot(point.x - last.x, point.y - last.y) >= APART) this.points.push(point);
+    follow(this.points, point);
   }
 
   /** @param {Point} point */

@@ -8,9 +8,7 @@
 
 import { clamp } from "../dom.js";
 import { trail } from "../stage/overlay.js";
-
-const APART = 3;
-const MOST_POINTS = 1500;
+import { follow } from "./gesture.js";
 
 /** @implements {Tool} */
 export class StrokeTool {
@@ -44,9 +42,7 @@ export class StrokeTool {
   /** @param {Point} point */
   move(point) {
     this.at = point;
-    const last = this.points.at(-1);
-    if (!last || this.points.length >= MOST_POINTS) return;
-    if (Math.hypot(point.x - last.x, point.y - last.y) >= APART) this.points.push(point);
+    follow(this.points, point);
   }
 
   /** @param {Point} point */
