@@ -15,6 +15,7 @@ void register_adam(nb::module_& m);
 void register_product(nb::module_& m);
 void register_csr(nb::module_& m);
 void register_memberships(nb::module_& m);
+void register_merging(nb::module_& m);
 void register_mesh_hits(nb::module_& m);
 void register_neighbours(nb::module_& m);
 void register_retrieve(nb::module_& m);
@@ -44,6 +45,7 @@ NB_MODULE(_native, m) {
   register_product(m);
   register_csr(m);
   register_memberships(m);
+  register_merging(m);
   register_mesh_hits(m);
   register_neighbours(m);
   register_retrieve(m);

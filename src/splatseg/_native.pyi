@@ -313,6 +313,25 @@ class Subset:
     ) -> None: ...
     def connected(self, seeds: Tensor, max_squared: float, marks: Tensor) -> None: ...
 
+def merge_regions(
+    *,
+    leaves: int,
+    pixels: float,
+    sums: NDArray[np.float64],
+    predicted: bool,
+    outlines: NDArray[np.float64],
+    boxes: NDArray[np.float64],
+    rim: NDArray[np.float64],
+    height: NDArray[np.float64],
+    pairs: NDArray[np.int64],
+    borders: NDArray[np.float64],
+    layers: Sequence[tuple[NDArray[np.float32], NDArray[np.float32]]],
+    scaling: NDArray[np.float32] | None,
+    blend: NDArray[np.float32],
+    merges: NDArray[np.int64],
+    costs: NDArray[np.float64],
+    record: bool,
+) -> tuple[int, NDArray[np.int64], NDArray[np.float32]]: ...
 def match_features(
     panels: Tensor,
     rows: int,

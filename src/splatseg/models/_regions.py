@@ -120,7 +120,7 @@ def _merged(image: Image, features: PixelFeatures, options: ClassicalOptions) ->
         tree = merge_tree(leaves, features)
     nodes, levels = _cut_nodes(tree, options)
     scores = _scores(tree)[nodes]
-    masks = _encode(_enlarged(leaves, height, width), tree, nodes)
+    masks = _encode(enlarged(leaves, height, width), tree, nodes)
     kept = [
         i
         for i in sorted(range(len(nodes)), key=lambda i: (levels[i], -tree.area[nodes[i]], i))
@@ -208,7 +208,7 @@ def _scores(tree: MergeTree) -> NDArray[np.float64]:
     return np.sqrt(np.clip(stability, 0, 1) * contrast)
 
 
-def _enlarged(labels: NDArray[np.int32], height: int, width: int) -> NDArray[np.int32]:
+def enlarged(labels: NDArray[np.int32], height: int, width: int) -> NDArray[np.int32]:
     """A label map at the photograph's own size: the label with most bilinear weight.
 
     Borders that run across the grid come out straight, not in steps as with the nearest label.

@@ -218,6 +218,10 @@ _ROWS: dict[str, _Row] = {
         "classical:make_classical", "ClassicalOptions", "docs/models.md", _MASKS,
         "masks and features by colour and edges: a stand-in that needs no weights",
     ),
+    "regions": _Row(
+        "regions:make_regions", "RegionOptions", "docs/models.md", ("masks",),
+        "masks of things and parts by small networks that come with splatseg",
+    ),
     "hed": _Row(
         "hed:Hed", "ClassicalOptions", "arXiv:1504.06375", ("masks",),
         "masks of what learned contours enclose, by a network that pip installs",

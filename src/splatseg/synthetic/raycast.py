@@ -32,6 +32,9 @@ class Truth:
     instance: Int[Tensor, "height width"]
     """int32 object, by the same rays."""
 
+    solid: Int64[Tensor, "height width"]
+    """Index in the scene's primitives, by the same rays; -1 where they meet nothing."""
+
     depth: Float[Tensor, "height width"]
     """z-depth in metres, by the same rays; 0 where they meet nothing."""
 
@@ -134,6 +137,7 @@ def render_truth(scene: SyntheticScene, camera: Camera) -> Truth:
         image=_shaded(scene, camera, order),
         semantic=_unordered(tables.semantic[which].masked_fill(miss, UNLABELLED), order, camera),
         instance=_unordered(tables.instance[which].masked_fill(miss, UNLABELLED), order, camera),
+        solid=_unordered(which, order, camera),
         depth=_unordered(depth, order, camera),
     )
 

@@ -2,6 +2,8 @@
 
 from splatseg_bench.worlds._classes import INTERIOR_CLASSES as INTERIOR_CLASSES
 from splatseg_bench.worlds._classes import STREET_CLASSES as STREET_CLASSES
+from splatseg_bench.worlds._clutter import clutter as clutter
+from splatseg_bench.worlds._clutter import clutter_camera as clutter_camera
 from splatseg_bench.worlds._pointmaps import PointmapErrors as PointmapErrors
 from splatseg_bench.worlds._pointmaps import SyntheticPointmaps as SyntheticPointmaps
 from splatseg_bench.worlds._pointmaps import synthetic_pointmaps as synthetic_pointmaps
