@@ -160,6 +160,23 @@ class AutomaticMasks(Model, Protocol):
         ...
 
 
+@runtime_checkable
+class DepthAwareMasks(AutomaticMasks, Protocol):
+    """Finds the things in an image better where the depth of what it shows is known."""
+
+    def masks_with_depth(
+        self, image: Image, depth: Float[Tensor, "height width"], focal: float
+    ) -> MaskSet:
+        """Masks of the image; they may overlap.
+
+        Args:
+            image: The image.
+            depth: z-depth of its pixels in any unit, 0 where there is nothing.
+            focal: Focal length in its pixels.
+        """
+        ...
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Embedding:
     """What a promptable model keeps of an image. A value: it can be cached and sent elsewhere."""

@@ -12,10 +12,19 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
+from jaxtyping import Float
+from torch import Tensor
+
 from splatseg.core import View
 from splatseg.core.boundary import boundary
 from splatseg.core.checkpoints import ABSENT, OptionDifference, option_differences
-from splatseg.core.models import Image, MaskTracker, Model, ModelWithDefaults
+from splatseg.core.models import (
+    DepthAwareMasks,
+    Image,
+    MaskTracker,
+    Model,
+    ModelWithDefaults,
+)
 from splatseg.errors import FileFormatError, InputError
 from splatseg.io.atomic import (
     TEMPORARY,
@@ -88,6 +97,9 @@ class EvidenceRequest:
     keep it in the folder where the evidence is being written, which it is given too. None takes
     photographs."""
 
+    depth_of: Callable[[View], Float[Tensor, "height width"]] | None = None
+    """Gives the z-depth of a view, 0 where there is nothing, to a model whose masks go by it."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DescribedEvidence:
@@ -152,6 +164,8 @@ def record_evidence(
         raise InputError("views: expected at least one view, got none.")
     questions = _distinct(request.what)
     pictures = Pictures(request.image_of)
+    if request.depth_of is not None and not isinstance(model, DepthAwareMasks):
+        raise InputError(f"depth: expected a model that takes depth, got {model.name!r}.")
     writers = _writers(model, views, questions, request, pictures)
     folder = Path(folder)
     folders = [folder, *(folder.with_name(f"{folder.name}.{one}") for one in questions[1:])]
@@ -220,7 +234,10 @@ def _writers(
     if isinstance(model, RecordedModel):
         missing = request.allow_missing
         return [CopiedEvidence(model, views, one, allow_missing=missing) for one in questions]
-    return [ComputedEvidence(model, views, one, pictures=pictures) for one in questions]
+    depth = request.depth_of
+    return [
+        ComputedEvidence(model, views, one, pictures=pictures, depth_of=depth) for one in questions
+    ]
 
 
 def _check_apart(target: Path, reads: Path | None) -> None:
@@ -292,7 +309,7 @@ def _open_target(
 def _metadata(model: Model, writer: EvidenceWriter, view_spec: str) -> dict[str, Any]:
     metadata = {
         "model": model.name,
-        "settings": dict(model.settings),
+        "settings": {**model.settings, **writer.settings},
         _DEFAULTS: dict(model.default_settings) if isinstance(model, ModelWithDefaults) else {},
         "what": writer.what,
         "note": model.note,

@@ -111,7 +111,7 @@ def masks_of_regions(
     predictions: Array,
     *,
     size: tuple[int, int],
-    networks: str,
+    kind: str,
     most: int,
     least: float,
 ) -> MaskSet:
@@ -119,15 +119,15 @@ def masks_of_regions(
 
     Args:
         image: At the working size.
-        contours: Of the kind that the networks were trained on.
+        contours: Of one of `KINDS`.
         predictions: Things and boxes.
         size: Height and width of the photograph, which the masks have.
-        networks: Name of the perceptrons: "own", or "hed" for contours of both networks.
+        kind: Of the contours.
         most: Masks.
         least: Share of the image that a mask has.
     """
     tensors = weights()
-    pair, node = (Perceptron.of(tensors, f"{networks}.{kind}.") for kind in ("pair", "node"))
+    pair, node = (Perceptron.of(tensors, f"{kind}.{of}.") for of in ("pair", "node"))
     pixels = described(image, contours, predictions)
     found = candidates(regions(pixels), pair)
     fits = node(found.features)

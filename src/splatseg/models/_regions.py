@@ -2,7 +2,6 @@
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from numpy.typing import NDArray
 
 from splatseg.core import UNLABELLED, LabelMap, MaskSet, Rle
@@ -80,35 +79,6 @@ def region_masks(image: Image, options: ClassicalOptions | None = None) -> MaskS
     with one_thread():
         small = reduced(image, WORKING_SIZE)
         features = pixel_features(small)
-    return _merged(image, features, options or ClassicalOptions())
-
-
-@boundary
-def nested_masks(
-    image: Image, contours: Float[np.ndarray, "h w c"], options: ClassicalOptions | None = None
-) -> MaskSet:
-    """Nested masks of the regions that contours enclose: `region_masks` by these contours.
-
-    Their strength takes the place of the strength of edges, in the watershed and along borders.
-
-    Args:
-        image: An image of any size.
-        contours: Probability of a contour in [0, 1] at each pixel of the image reduced to h by w;
-            channel 0 counts.
-        options: Where the hierarchy is cut.
-
-    Returns:
-        As `region_masks`.
-    """
-    import cv2
-
-    height, width = contours.shape[:2]
-    with one_thread():
-        array = np.ascontiguousarray(image.cpu().numpy())
-        if array.shape[:2] != (height, width):
-            array = cv2.resize(array, (width, height), interpolation=cv2.INTER_AREA)
-        array = np.asarray(array, np.uint8)
-        features = pixel_features(array, strength=np.ascontiguousarray(contours[..., 0]))
     return _merged(image, features, options or ClassicalOptions())
 
 

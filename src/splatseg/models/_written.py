@@ -4,9 +4,12 @@ import shutil
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, ClassVar
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 from typing_extensions import override
 
 from splatseg._check import check_choice
@@ -95,6 +98,9 @@ class EvidenceWriter(ABC):
 
     details: Mapping[str, Any]
     """Further metadata."""
+
+    settings: Mapping[str, Any] = MappingProxyType({})
+    """What changes the evidence besides the model's settings and the images."""
 
     reads: Path | None = None
     """Folder of evidence that is read, which is not to be written to."""
@@ -218,7 +224,13 @@ class ComputedEvidence(EvidenceWriter):
     keep_partial = True
 
     def __init__(
-        self, model: Any, views: Sequence[View], what: str | None, *, pictures: Pictures
+        self,
+        model: Any,
+        views: Sequence[View],
+        what: str | None,
+        *,
+        pictures: Pictures,
+        depth_of: Callable[[View], Float[Tensor, "height width"]] | None = None,
     ) -> None:
         self.views = views
         self.details = {}
@@ -228,6 +240,9 @@ class ComputedEvidence(EvidenceWriter):
             self.classes = model.classes if self.what == "labels" else model.categories
         self._model = model
         self.pictures = pictures
+        self._depth_of = depth_of if self.what == "masks" else None
+        if self._depth_of is not None:
+            self.settings = {"depth_from_scene": True}
         self._counts: dict[str, int] = {}
         """Masks by view, for the notes."""
 
@@ -241,7 +256,10 @@ class ComputedEvidence(EvidenceWriter):
     @override
     def write(self, folder: Path, view: View) -> int:
         image = self.pictures.of(view, folder)
-        found = getattr(self._model, _QUESTIONS[self.what][2])(image)
+        if self._depth_of is not None:
+            found = self._model.masks_with_depth(image, self._depth_of(view), view.camera.fx)
+        else:
+            found = getattr(self._model, _QUESTIONS[self.what][2])(image)
         maps: Sequence[Any] = (found,)
         if isinstance(found, DeepFeatures | Panoptic):
             maps = found.maps if isinstance(found, DeepFeatures) else (found.ids,)

@@ -1,4 +1,4 @@
-"""HED: contours of photographs by a published network, and the nested masks that they enclose.
+"""HED: contours of photographs by a published network, and the masks that they enclose.
 
 Xie and Tu 2015, "Holistically-Nested Edge Detection" (arXiv:1504.06375): the five blocks of VGG-16
 without their last pooling, each with a side output that predicts contours at its own scale, fused
@@ -25,12 +25,13 @@ from splatseg.core.threads import network_inference
 from splatseg.errors import FileFormatError, RangeError, import_package
 from splatseg.io.foreign import expect, reading
 from splatseg.models._merge_tree import one_thread
-from splatseg.models._regions import WORKING_SIZE, nested_masks, reduced
-from splatseg.models._regions import ClassicalOptions as ClassicalOptions
+from splatseg.models._regions import WORKING_SIZE, reduced
 from splatseg.models._weights import Loading
 from splatseg.models.networks._library import BatchedNetwork
+from splatseg.models.regions import RegionOptions as RegionOptions
+from splatseg.models.regions import learned_masks
 
-ALGORITHM = 1
+ALGORITHM = 2
 """Grows when the same settings give other masks, so that cached ones are not taken for new."""
 
 SCALES = (0.5, 1.0, 1.5)
@@ -113,7 +114,7 @@ class Hed(BatchedNetwork[NDArray[np.float32]]):
         {"algorithm": ALGORITHM, "scales": list(SCALES)}
     )
 
-    def __init__(self, name: str, options: ClassicalOptions, place: Loading) -> None:
+    def __init__(self, name: str, options: RegionOptions, place: Loading) -> None:
         super().__init__(name, options, place)
         if place.file is None:
             raise FileFormatError(f"{place.folder}: expected a file of weights, got a folder.")
@@ -126,8 +127,15 @@ class Hed(BatchedNetwork[NDArray[np.float32]]):
         self._regions = options
 
     def masks(self, image: Image) -> MaskSet:
-        """Nested masks of several granularities that the contours enclose: `nested_masks`."""
-        return nested_masks(image, self.contours(image), self._regions)
+        """Masks of things and parts by these contours and those of `regions`: `learned_masks`."""
+        return learned_masks(image, self._regions, hed=self.contours(image))
+
+    def masks_with_depth(
+        self, image: Image, depth: Float[Tensor, "height width"], focal: float
+    ) -> MaskSet:
+        """The same, by the steps and folds of the depth too."""
+        contours = self.contours(image)
+        return learned_masks(image, self._regions, hed=contours, depth=depth, focal=focal)
 
     def contours(self, image: Image) -> Float[np.ndarray, "h w 9"]:
         """How likely each pixel lies on the outline of something.

@@ -5,14 +5,18 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
+from torch import Tensor
 
+from splatseg._check import check_range, check_shape
 from splatseg.core import MaskSet
 from splatseg.core.boundary import boundary
 from splatseg.core.models import Image
 from splatseg.core.options import Count, Share, options
 from splatseg.core.threads import network_inference
 from splatseg.models._merge_tree import one_thread
-from splatseg.models._region_masks import masks_of_regions
+from splatseg.models._region_masks import depth_contours, masks_of_regions, with_hed
 from splatseg.models._region_network import contours_and_boxes, region_network
 from splatseg.models._regions import WORKING_SIZE, reduced
 
@@ -61,6 +65,12 @@ class Regions:
         """Masks of things and parts: `learned_masks`."""
         return learned_masks(image, self.regions)
 
+    def masks_with_depth(
+        self, image: Image, depth: Float[Tensor, "height width"], focal: float
+    ) -> MaskSet:
+        """The same, by the steps and folds of the depth too."""
+        return learned_masks(image, self.regions, depth=depth, focal=focal)
+
 
 def make_regions(_name: str, options: RegionOptions, _place: object) -> Regions:
     """The model of the family's options."""
@@ -68,7 +78,14 @@ def make_regions(_name: str, options: RegionOptions, _place: object) -> Regions:
 
 
 @boundary
-def learned_masks(image: Image, options: RegionOptions | None = None) -> MaskSet:
+def learned_masks(
+    image: Image,
+    options: RegionOptions | None = None,
+    *,
+    hed: Float[np.ndarray, "h w 9"] | None = None,
+    depth: Float[Tensor, "height width"] | None = None,
+    focal: float = 0.0,
+) -> MaskSet:
     """Masks of things and parts of a photograph, the best first.
 
     Outlines and boxes are predicted, basins of the outlines merged in three orders, and the best
@@ -77,17 +94,48 @@ def learned_masks(image: Image, options: RegionOptions | None = None) -> MaskSet
     Args:
         image: An image of any size.
         options: How many, and how small.
+        hed: `Hed.contours` of the image, in the size of which the work is done.
+        depth: z-depth of its pixels in any unit, 0 where there is nothing.
+        focal: Focal length in pixels of the image; needed with `depth`.
 
     Returns:
         Masks in the image's own pixels. A score is the predicted IoU with a true thing or part,
         whichever is larger; level 0 are masks that are rather parts, level 1 rather things.
     """
-    with one_thread(), network_inference():
-        small = np.asarray(reduced(image, WORKING_SIZE), np.uint8)
-        contours, predictions = contours_and_boxes(region_network(), small)
-    chosen = options or RegionOptions()
     height, width = (int(side) for side in image.shape[:2])
+    with one_thread(), network_inference():
+        small = np.asarray(
+            reduced(image, WORKING_SIZE if hed is None else max(hed.shape[:2])), np.uint8
+        )
+        contours, predictions = contours_and_boxes(region_network(), small)
+    kind = "own"
+    if hed is not None:
+        check_shape("hed", hed, (*small.shape[:2], None))
+        kind, contours = "hed", with_hed(contours, hed)
+    if depth is not None:
+        check_shape("depth", depth, (height, width))
+        check_range("focal", focal, 1e-3, 1e9)
+        kind = "depth" if hed is None else "hed-depth"
+        less = small.shape[1] / width
+        steps = depth_contours(_resized_depth(depth, small.shape[:2]), focal * less)
+        contours = np.concatenate((contours, steps), axis=2)
+    chosen = options or RegionOptions()
     return masks_of_regions(
-        small, contours, predictions, size=(height, width), networks="own",
+        small, contours, predictions, size=(height, width), kind=kind,
         most=chosen.max_masks, least=chosen.min_area,
     )  # fmt: skip
+
+
+def _resized_depth(
+    depth: Float[Tensor, "height width"], size: tuple[int, ...]
+) -> NDArray[np.float32]:
+    """Depth at the working size: the mean of inverse depth, which is affine on planes."""
+    import cv2
+
+    plane = depth.cpu().numpy().astype(np.float32)
+    if plane.shape == size:
+        return plane
+    inverse = np.where(plane > 0, 1 / np.maximum(plane, 1e-6), 0).astype(np.float32)
+    with one_thread():
+        small = cv2.resize(inverse, size[::-1], interpolation=cv2.INTER_AREA)
+    return np.where(small > 0, 1 / np.maximum(small, 1e-9), 0).astype(np.float32)

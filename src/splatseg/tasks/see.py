@@ -90,6 +90,10 @@ class SeeOptions:
     tracking: TrackingOptions = field(default_factory=TrackingOptions)
     """Which seeds count, and the order of the views."""
 
+    depth_from_scene: bool = False
+    """Tell a model of masks the depth of the scene's Gaussians too, whose steps and folds are
+    borders that colours hide; models regions and hed."""
+
     overwrite: bool = False
     """Replace what an earlier run wrote under the same name."""
 
@@ -158,6 +162,7 @@ def see(
                 seeds=seeds,
                 tracking=tracking,
                 image_of=images,
+                depth_of=_scene_depth(work) if options.depth_from_scene else None,
             ),
             progress=step,
         )
@@ -172,6 +177,18 @@ def see(
     for note in seen.notes:
         observer.note(note)
     return seen
+
+
+def _scene_depth(work: Work) -> Callable[[View], Float[Tensor, "height width"]]:
+    field = work.field()
+
+    def depth(view: View) -> Float[Tensor, "height width"]:
+        with field.view(view.camera) as prepared:
+            signals = prepared.signals(colour=False)
+        # NaN is what the renderer could not tell.
+        return torch.where(signals.alpha > _SEEN_THROUGH, signals.depth, 0).nan_to_num(0.0)
+
+    return depth
 
 
 def _model(
@@ -337,6 +354,9 @@ def _pieces(named: str) -> list[str]:
             found.append(piece)
     return found
 
+
+_SEEN_THROUGH = 0.5
+"""Share of a pixel's light that is stopped where there is a depth."""
 
 _GREYS = (0.0, 1.0, 0.5)
 # A scene that fills its views has no background to speak of, and it stays black.
