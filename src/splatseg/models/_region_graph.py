@@ -23,7 +23,7 @@ Rows = NDArray[np.int64]
 
 _L_BINS = np.linspace(0.0, 100.0, 13, dtype=np.float32)
 _AB_BINS = np.linspace(-48.0, 48.0, 17, dtype=np.float32)
-"""Bins of CIE Lab, in its own units. Colours indoors and outdoors lie near grey: +-48 holds them."""
+"""Bins of CIE Lab, in its own units. Colours of scenes lie near grey: +-48 holds them."""
 
 _COLOUR_SCALE = 25.0
 """Units of Lab that a spread of colour is given in."""

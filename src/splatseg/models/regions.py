@@ -15,6 +15,7 @@ from splatseg.core.boundary import boundary
 from splatseg.core.models import Image
 from splatseg.core.options import Count, Share, options
 from splatseg.core.threads import network_inference
+from splatseg.errors import ShapeError
 from splatseg.models._merge_tree import one_thread
 from splatseg.models._region_masks import depth_contours, masks_of_regions, with_hed
 from splatseg.models._region_network import contours_and_boxes, region_network
@@ -104,13 +105,13 @@ def learned_masks(
     """
     height, width = (int(side) for side in image.shape[:2])
     with one_thread(), network_inference():
-        small = np.asarray(
-            reduced(image, WORKING_SIZE if hed is None else max(hed.shape[:2])), np.uint8
-        )
+        size = WORKING_SIZE if hed is None else max(hed.shape[:2])
+        small = np.asarray(reduced(image, size), np.uint8)
         contours, predictions = contours_and_boxes(region_network(), small)
     kind = "own"
     if hed is not None:
-        check_shape("hed", hed, (*small.shape[:2], None))
+        if hed.shape[:2] != small.shape[:2]:
+            raise ShapeError(f"hed: expected {small.shape[:2]} pixels, got {hed.shape[:2]}.")
         kind, contours = "hed", with_hed(contours, hed)
     if depth is not None:
         check_shape("depth", depth, (height, width))
