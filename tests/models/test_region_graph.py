@@ -9,7 +9,9 @@ import torch
 from splatseg import _native
 from splatseg.models._region_graph import Perceptron, Pixels, described, merge, regions
 from splatseg.models._region_masks import (
+    SMALLEST,
     Candidates,
+    candidates,
     depth_contours,
     encoded,
     select,
@@ -125,8 +127,11 @@ def test_nodes_of_a_tree_by_hand() -> None:
     assert tree.merges.tolist() == [[1, 2], [0, 3]]
     np.testing.assert_allclose(tree.costs, [0.3, 0.9], atol=1e-6)
     assert tree.area.tolist() == [12, 12, 24, 36, 48]
-    inside = tree.members(np.arange(5)).astype(int).tolist()
-    assert inside == [[1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 1, 1], [1, 1, 1]]
+    first, below = tree.spans()
+    assert below.tolist() == [1, 1, 1, 2, 3]
+    assert first[4] == first[0] == 0
+    assert first[3] == first[1] == 1
+    assert first[2] == 2
     features = tree.node_features()
     height, death, cost, of_parent = features[:, :4].T
     np.testing.assert_allclose(height, [0, 0, 0, 0.3, 0.9], atol=1e-6)
@@ -184,13 +189,39 @@ def test_a_perceptron_is_its_layers(rng) -> None:
     np.testing.assert_array_equal(again(features), model(features))
 
 
+def test_candidates_are_nodes_of_three_trees_and_how_well_they_agree(rng) -> None:
+    found = regions(picture(rng, 60, 80, predicted=True))
+    pair = perceptron(rng, found.borders.shape[1] - 1 + 35 + 23)
+    nodes = candidates(found, pair)
+    assert set(nodes.tree.tolist()) == {0, 1, 2}
+    areas = found.sums[:, 0]
+    inside = nodes.members(np.arange(len(nodes.areas)))
+    np.testing.assert_array_equal(nodes.areas, inside @ areas)
+    assert float(nodes.areas.min()) >= SMALLEST * 60 * 80
+    trees = [merge(found, pair, (0, 1)), merge(found, pair, (1, 0)), merge(found, None)]
+    assert len(nodes.areas) == sum(int((t.area >= SMALLEST * 60 * 80).sum()) for t in trees)
+    sets = [frozenset(np.flatnonzero(one).tolist()) for one in inside]
+    for i in range(0, len(sets), 7):
+        own = [float(v) for v in nodes.features[i, -5:-2]]
+        assert own == [float(k == nodes.tree[i]) for k in range(3)]
+        for column, other in enumerate(k for k in range(3) if k != nodes.tree[i]):
+            best = max(
+                sum(areas[list(sets[i] & sets[j])]) / sum(areas[list(sets[i] | sets[j])])
+                for j in np.flatnonzero(nodes.tree == other).tolist()
+            )
+            assert nodes.features[i, -2 + column] == pytest.approx(best, rel=1e-5)
+
+
 def test_selection_takes_the_best_that_repeat_nothing() -> None:
-    members = np.array([[1, 1, 0, 0], [1, 1, 1, 0], [0, 0, 1, 0], [0, 0, 0, 1]], np.float32)
-    basins = np.array([10, 10, 4, 3], np.float32)
+    """Basins of 10, 10, 4 and 3 pixels; candidates of two trees."""
     found = Candidates(
-        members=members, features=np.zeros((4, 1), np.float32), areas=members @ basins,
-        basin_areas=basins,
+        features=np.zeros((4, 1), np.float32), areas=np.array([20, 24, 4, 3], np.float32),
+        tree=np.array([0, 0, 1, 1]), spans=np.array([[0, 2], [0, 3], [0, 1], [1, 2]]),
+        places=np.array([[0, 1, 2, 3], [3, 2, 0, 1]]),
+        basin_areas=np.array([10, 10, 4, 3], np.float32),
     )  # fmt: skip
+    inside = [[1, 1, 0, 0], [1, 1, 1, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+    assert found.members(np.arange(4)).astype(int).tolist() == inside
     scores = np.array([0.5, 0.9, 0.2, 0.8])
     # 20 of 24 pixels are shared by the first two.
     assert select(found, scores, most=9, least=0).tolist() == [1, 3, 2]

@@ -330,18 +330,19 @@ class Hierarchy:
                 ]
         return np.stack(rows, 1).astype(np.float32)
 
-    def members(self, nodes: Rows) -> NDArray[np.bool_]:
-        """(k, leaves) which basins are below each of some nodes."""
-        # Basins in the order of a walk through the tree: below a node they are neighbours.
+    def spans(self) -> tuple[Rows, Rows]:
+        """Places of basins in a walk through the tree: below a node they are neighbours.
+
+        Returns:
+            (nodes,) the first place below each node, of a basin its own, and how many there are.
+        """
         first, below = np.zeros(len(self.sums), np.int64), np.ones(len(self.sums), np.int64)
         for node, (a, b) in enumerate(self.merges.tolist(), self.leaves):
             below[node] = below[a] + below[b]
         for node in range(len(self.sums) - 1, self.leaves - 1, -1):
             a, b = self.merges[node - self.leaves]
             first[a], first[b] = first[node], first[node] + below[a]
-        place = first[: self.leaves]
-        start = first[nodes][:, None]
-        return (place >= start) & (place < start + below[nodes][:, None])
+        return first, below
 
 
 def merge(

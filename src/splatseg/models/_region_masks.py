@@ -7,7 +7,7 @@ are taken that do not repeat one another. Both networks were trained on generate
 with exact truth (`scripts/train_regions`), on no photograph.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -31,12 +31,14 @@ from splatseg.models._region_graph import (
 from splatseg.models._region_network import weights
 from splatseg.models._regions import enlarged
 
-SMALLEST = 150 / (512 * 384)
+SMALLEST = 250 / (512 * 384)
 """Share of the image that a candidate has at least; that of the training."""
+
+_AT_ONCE = 256
+"""Nodes whose basins are held densely."""
 
 REPEATED = 0.6
 """Of candidates whose IoU is larger the better one is taken."""
-
 
 KINDS = ("own", "depth", "hed", "hed-depth")
 """Contours that there are perceptrons for: own ones; with those of depth, of HED, of both."""
@@ -47,61 +49,100 @@ BLENDS = ((0.0, 1.0), (1.0, 0.0))
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Candidates:
-    """Nodes of all hierarchies that are large enough."""
-
-    members: Array
-    """(k, basins): 1 for those below a node."""
+    """Nodes of all hierarchies that are large enough: k of them, of t trees over n basins."""
 
     features: Array
-    """(k, f): of the node; its order, one of three; its best IoU with a node of each other one."""
+    """(k, f): of the node; its order, one of t; its best IoU with a node of each other tree."""
 
     areas: Array
     """(k,) pixels."""
 
+    tree: Rows
+    """(k,) which tree a node is of."""
+
+    spans: Rows
+    """(k, 2): first and last place in its tree's walk, the last one excluded."""
+
+    places: Rows
+    """(t, n): place of each basin in each tree's walk."""
+
     basin_areas: Array
-    """(basins,) pixels."""
+    """(n,) pixels."""
+
+    def members(self, rows: Rows) -> NDArray[np.bool_]:
+        """(rows, n) which basins are below some of the candidates."""
+        places, spans = self.places[self.tree[rows]], self.spans[rows]
+        return (places >= spans[:, :1]) & (places < spans[:, 1:])
 
 
 def candidates(basic: Regions, pair: Perceptron) -> Candidates:
     """Merge in each order, and keep the nodes that are large enough."""
     trees = [*(merge(basic, pair, blend) for blend in BLENDS), merge(basic, None)]
-    basins = basic.sums[:, 0].astype(np.float32)
-    members: list[Array] = []
+    least = SMALLEST * basic.pixels
     features: list[Array] = []
-    for tree in trees:
-        large = np.flatnonzero(tree.area >= SMALLEST * tree.pixels)
-        members.append(tree.members(large).astype(np.float32))
-        features.append(tree.node_features()[large])
-    # Sums of pixels below 2^24 are exact in float32, in whichever order a product takes them.
-    areas = [inside @ basins for inside in members]
-    for i in range(len(trees)):
-        order = np.zeros((len(areas[i]), len(trees)), np.float32)
+    spans: list[Rows] = []
+    places: list[Rows] = []
+    large = [np.flatnonzero(tree.area >= least) for tree in trees]
+    for i, tree in enumerate(trees):
+        first, below = tree.spans()
+        places.append(first[: tree.leaves])
+        spans.append(np.stack((first[large[i]], first[large[i]] + below[large[i]]), axis=1))
+        order = np.zeros((len(large[i]), len(trees)), np.float32)
         order[:, i] = 1
-        features[i] = np.concatenate((features[i], order), axis=1)
-    for i in range(len(trees)):
-        for j in range(i):
-            shared = (members[i] * basins) @ members[j].T
-            ious = shared / (areas[i][:, None] + areas[j] - shared)
-            features[i] = np.concatenate((features[i], ious.max(1)[:, None]), axis=1)
-            features[j] = np.concatenate((features[j], ious.max(0)[:, None]), axis=1)
-    return Candidates(
-        members=np.concatenate(members),
-        features=np.concatenate(features),
-        areas=np.concatenate(areas),
-        basin_areas=basins,
+        features.append(np.concatenate((tree.node_features()[large[i]], order), axis=1))
+    found = Candidates(
+        features=np.zeros((0, 0), np.float32),
+        areas=np.concatenate(
+            [tree.area[rows] for tree, rows in zip(trees, large, strict=True)]
+        ).astype(np.float32),
+        tree=np.concatenate([np.full(len(rows), i) for i, rows in enumerate(large)]),
+        spans=np.concatenate(spans),
+        places=np.stack(places),
+        basin_areas=basic.sums[:, 0].astype(np.float32),
     )
+    agreement = [_agreement(found, i, len(trees)) for i in range(len(trees))]
+    rows = [np.concatenate(both, axis=1) for both in zip(features, agreement, strict=True)]
+    return replace(found, features=np.concatenate(rows))
+
+
+def _agreement(found: Candidates, tree: int, trees: int) -> Array:
+    """(nodes of a tree, trees - 1): the best IoU with a node of each other tree.
+
+    Basins in the order of another tree's walk have sums from the first place on; what a node of
+    that tree shares is a difference of two. Sums of pixels below 2^24 are exact in float32.
+    """
+    rows = np.flatnonzero(found.tree == tree)
+    best = np.zeros((len(rows), trees - 1), np.float32)
+    for begin in range(0, len(rows), _AT_ONCE):
+        some = rows[begin : begin + _AT_ONCE]
+        shares = found.members(some) * found.basin_areas
+        for column, other in enumerate(k for k in range(trees) if k != tree):
+            theirs = found.tree == other
+            start, end = found.spans[theirs].T
+            walked = np.zeros((len(some), shares.shape[1] + 1), np.float32)
+            np.cumsum(shares[:, np.argsort(found.places[other])], axis=1, out=walked[:, 1:])
+            common = walked[:, end] - walked[:, start]
+            ious = common / (found.areas[some][:, None] + found.areas[theirs] - common)
+            best[begin : begin + len(some), column] = ious.max(1)
+    return best
 
 
 def select(found: Candidates, scores: Floats, *, most: int, least: float) -> Rows:
     """The best `most` candidates of at least `least` pixels of which none repeats a better one."""
-    alive = found.areas >= least
-    weighted = found.members * found.basin_areas
     taken: list[int] = []
+    weighted = np.zeros((most, len(found.basin_areas)), np.float32)
+    areas = np.zeros(most, np.float32)
     for i in np.argsort(-scores, kind="stable").tolist():
-        if alive[i] and len(taken) < most:
+        if len(taken) == most:
+            break
+        if found.areas[i] < least:
+            continue
+        inside = found.members(np.array([i]))[0].astype(np.float32)
+        count = len(taken)
+        shared = weighted[:count] @ inside
+        if np.all(shared / (areas[:count] + found.areas[i] - shared) <= REPEATED):
+            weighted[count], areas[count] = inside * found.basin_areas, found.areas[i]
             taken.append(i)
-            shared = weighted @ found.members[i]
-            alive &= shared / (found.areas + found.areas[i] - shared) <= REPEATED
     return np.array(taken, np.int64)
 
 
@@ -136,7 +177,7 @@ def masks_of_regions(
     )
     height, width = size
     labels = enlarged(pixels.basins.astype(np.int32), height, width)
-    masks = encoded(labels, found.members[taken] > 0)
+    masks = encoded(labels, found.members(taken))
     best = fits[taken]
     return MaskSet(
         height=height,
