@@ -239,12 +239,12 @@ def test_masks_are_runs_of_their_regions(rng) -> None:
 
 
 def test_contours_of_both_networks_begin_with_their_mean(rng) -> None:
-    own, hed = rng.random((3, 4, 4)).astype(np.float32), rng.random((3, 4, 9)).astype(np.float32)
+    own, hed = rng.random((3, 4, 6)).astype(np.float32), rng.random((3, 4, 9)).astype(np.float32)
     both = with_hed(own, hed)
-    assert both.shape == (3, 4, 14)
+    assert both.shape == (3, 4, 16)
     np.testing.assert_allclose(both[..., 0], (own[..., 0] + hed[..., 0]) / 2)
-    np.testing.assert_array_equal(both[..., 1:5], own)
-    np.testing.assert_array_equal(both[..., 5:], hed)
+    np.testing.assert_array_equal(both[..., 1:7], own)
+    np.testing.assert_array_equal(both[..., 7:], hed)
 
 
 def plane(height: int, width: int, focal: float, normal: tuple[float, float, float]) -> np.ndarray:

@@ -1,5 +1,6 @@
 """Training of the network of regions (`splatseg.models._region_network`) on generated pictures."""
 
+import zlib
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -19,6 +20,9 @@ Array = NDArray[np.float32]
 Ids = NDArray[np.int32]
 
 _CONTOURS, _HED, _THING = slice(0, 2), 2, 3
+_SIDE = 256
+"""Pixels of a crop."""
+
 _COARSE = 4
 """Pixels of the head's map to one of the coarse head's."""
 
@@ -31,8 +35,6 @@ class Recipe:
     steps: int = 8_000
     crops: int = 6
     """Of a step."""
-    side: int = 256
-    """Pixels of a crop."""
     scales: tuple[float, float] = (0.5, 1.3)
     """Sizes that pictures are cut at, drawn evenly by their logarithm."""
     rate: float = 3e-3
@@ -44,6 +46,8 @@ class Recipe:
     """Weight of the loss of boxes."""
     textured: float = 0.5
     """Share of crops whose parts get a random texture each."""
+    printed: float = 0.0
+    """Share of parts that show a piece of another picture, as posters, screens and plaids do."""
 
 
 def train(
@@ -51,13 +55,25 @@ def train(
     recipe: Recipe,
     checkpoint: Path,
     report: Callable[[str], None],
-) -> RegionNetwork:
-    """Train, going on from the checkpoint if there is one: the same as if it had not stopped."""
+    *,
+    start: Path | None = None,
+) -> None:
+    """Train, going on from the checkpoint if there is one: the same as if it had not stopped.
+
+    Args:
+        pictures: What `draw_pictures` wrote.
+        recipe: What decides the weights.
+        checkpoint: File that is written every 500 steps.
+        report: Told the losses.
+        start: Checkpoint whose weights training begins with; None begins with random ones.
+    """
     network: Any = RegionNetwork(normalised=True).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     torch.manual_seed(recipe.seed)
     for module in network.modules():
         if isinstance(module, torch.nn.Conv2d):
             module.reset_parameters()
+    if start is not None:
+        network.load_state_dict(torch.load(start, weights_only=True)["network"])
     optimiser = torch.optim.AdamW(network.parameters(), weight_decay=recipe.weight_decay)
     step, mean = 0, None
     if checkpoint.exists():
@@ -68,11 +84,17 @@ def train(
         optimiser.load_state_dict(state["optimiser"])
         step = state["step"]
     held = dict[Path, tuple[Picture, Array | None]]()
-    textures = _noises(np.random.default_rng(recipe.seed))
+    textures = noises(recipe.seed)
     while step < recipe.steps:
         rng = np.random.default_rng([recipe.seed, step])
         batch = [
-            _crop(_held(held, pictures[rng.integers(len(pictures))]), rng, recipe, textures)
+            _crop(
+                _held(held, pictures[rng.integers(len(pictures))]),
+                rng,
+                recipe,
+                textures,
+                _held(held, pictures[rng.integers(len(pictures))])[0] if recipe.printed else None,
+            )
             for _ in range(recipe.crops)
         ]
         losses = _losses(network, batch, recipe)
@@ -93,7 +115,6 @@ def train(
             part = checkpoint.with_suffix(".part")
             torch.save(state | {"step": step, "recipe": _plain(recipe)}, part)
             part.rename(checkpoint)
-    return network.eval()
 
 
 def _plain(recipe: Recipe) -> dict[str, Any]:
@@ -145,7 +166,11 @@ def _loss(
 
 
 def _crop(
-    picture: tuple[Picture, Array | None], rng: np.random.Generator, recipe: Recipe, textures: Array
+    picture: tuple[Picture, Array | None],
+    rng: np.random.Generator,
+    recipe: Recipe,
+    textures: Array,
+    other: Picture | None,
 ) -> tuple[Array, Array, Array, bool]:
     """A crop and what the network is to say of it.
 
@@ -155,7 +180,7 @@ def _crop(
     """
     one, hed = picture
     height, width = one.part.shape
-    side = recipe.side
+    side = _SIDE
     scale = float(np.exp(rng.uniform(*np.log(recipe.scales))))
     rows = min(int(side / scale), height)
     columns = min(int(rows * rng.uniform(1, 1.25)), width)
@@ -187,7 +212,11 @@ def _crop(
             *boxes,
         )
     )
-    pixels = _photographed(image, part, rng, recipe, textures)
+    print_share = recipe.printed if other is not None else 0.0
+    pixels = photographed(
+        image if other is None else with_prints(image, part, other.image, rng, print_share),
+        part, rng, textures, recipe.textured,
+    )  # fmt: skip
     pixels = np.ascontiguousarray(((pixels - 0.45) / 0.25).transpose(2, 0, 1), np.float32)
     if len(targets) != OUTPUTS:
         raise RuntimeError(f"expected {OUTPUTS} targets, got {len(targets)}.")
@@ -238,8 +267,9 @@ def _boxes(ids: Ids) -> tuple[Array, Array]:
     return np.log1p(distances.clip(0) / BOX_SCALE), weights / weights.mean()
 
 
-def _noises(rng: np.random.Generator, count: int = 24, side: int = 320) -> Array:
+def noises(seed: int, count: int = 24, side: int = 320) -> Array:
     """(count, side, side) noises of mean 0 and deviation 1 whose spectra fall by 1/f to 1/f^2."""
+    rng = np.random.default_rng(seed)
     along = np.fft.fftfreq(side)
     frequency = np.hypot(along[:, None], along[None]) + 1 / side
     found: list[Array] = []
@@ -253,20 +283,61 @@ def _noises(rng: np.random.Generator, count: int = 24, side: int = 320) -> Array
     return np.stack(found)
 
 
-def _photographed(
-    image: NDArray[np.uint8], part: Ids, rng: np.random.Generator, recipe: Recipe, textures: Array
+def as_photograph(path: Path, other: Path) -> NDArray[np.uint8]:
+    """A picture in other materials, with pieces of another one; the same each time."""
+    rng = np.random.default_rng(zlib.crc32(path.name.encode()))
+    picture = read_picture(path)
+    image = with_prints(picture.image, picture.part, read_picture(other).image, rng, 0.12)
+    pixels = photographed(image, picture.part, rng, noises(1), 0.6)
+    return (255 * pixels).round().astype(np.uint8)
+
+
+def with_prints(
+    image: NDArray[np.uint8],
+    part: Ids,
+    other: NDArray[np.uint8],
+    rng: np.random.Generator,
+    share: float,
+) -> NDArray[np.uint8]:
+    """The picture with pieces of another one printed on some parts, shaded as these are."""
+    values, labels = np.unique(part, return_inverse=True)
+    labels = labels.reshape(part.shape)
+    printed = np.flatnonzero(rng.random(len(values)) < share)
+    if not len(printed):
+        return image
+    height, width = part.shape
+    found = image.astype(np.float32)
+    light = found.mean(2)
+    y, x = np.mgrid[:height, :width].astype(np.float32)
+    for k in printed.tolist():
+        inside = labels == k
+        scale, turn = float(np.exp(rng.uniform(-1.2, 0.7))), rng.uniform(0, 2 * np.pi)
+        c, s = np.float32(scale * np.cos(turn)), np.float32(scale * np.sin(turn))
+        shift = rng.uniform(0, 400, 2).astype(np.float32)
+        shown = cv2.remap(
+            other, c * x - s * y + shift[0], s * x + c * y + shift[1], cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_REFLECT,
+        )  # fmt: skip
+        shade = light[inside] / max(float(light[inside].mean()), 1.0)
+        found[inside] = np.asarray(shown, np.float32)[inside] * shade.clip(0.3, 2)[:, None]
+    return found.clip(0, 255).astype(np.uint8)
+
+
+def photographed(
+    image: NDArray[np.uint8], part: Ids, rng: np.random.Generator, textures: Array, textured: float
 ) -> Array:
     """The picture in [0, 1] as other materials, light, lenses and cameras would have it."""
     x = image.astype(np.float32) / 255
-    side = len(x)
-    if rng.random() < recipe.textured:
+    height, width = part.shape
+    if rng.random() < textured:
         values, labels = np.unique(part, return_inverse=True)
         labels = labels.reshape(part.shape)
         which = rng.integers(len(textures), size=len(values))
         strength = np.where(rng.random(len(values)) < 0.6, rng.gamma(1.5, 0.06, len(values)), 0)
         tint = 1 + 0.5 * rng.normal(size=(len(values), 3)) * rng.random((len(values), 1))
-        dy, dx = rng.integers(textures.shape[1] - side + 1, size=2)
-        rows, columns = np.mgrid[dy : dy + side, dx : dx + side]
+        # Noises go on where they end.
+        dy, dx = rng.integers(textures.shape[1] - _SIDE + 1, size=2)
+        rows, columns = np.mgrid[dy : dy + height, dx : dx + width] % textures.shape[1]
         noise = textures[which[labels], rows, columns]
         x = x * np.exp(np.clip(noise * strength[labels], -1.2, 1.2)[..., None] * tint[labels])
         x = x.astype(np.float32)
@@ -282,7 +353,7 @@ def _photographed(
         x = np.asarray(cv2.GaussianBlur(x, (0, 0), float(rng.uniform(0.4, 1.6))))
     if rng.random() < 0.3:
         light = rng.normal(0, 0.25, (3, 3)).astype(np.float32)
-        light = cv2.resize(light, (side, side), interpolation=cv2.INTER_CUBIC)
+        light = cv2.resize(light, (width, height), interpolation=cv2.INTER_CUBIC)
         x = x * np.exp(np.asarray(light))[..., None]
     if rng.random() < 0.6:
         x = x + rng.normal(0, rng.uniform(0.003, 0.05), x.shape)
@@ -291,7 +362,7 @@ def _photographed(
         quality = [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(40, 95))]
         packed = cv2.imencode(".jpg", (255 * x).astype(np.uint8), quality)[1]
         x = np.asarray(cv2.imdecode(packed, cv2.IMREAD_COLOR), np.float32) / 255
-    return x
+    return x.astype(np.float32)
 
 
 def folded(network: RegionNetwork) -> dict[str, Tensor]:

@@ -194,7 +194,7 @@ def with_hed(contours: Array, hed: Array) -> Array:
     The mean of the two comes first, then what each says.
 
     Args:
-        contours: (h, w, 4) of `contours_and_boxes`.
+        contours: (h, w, 6) of `contours_and_boxes`.
         hed: (h, w, 9) of `Hed.contours`.
     """
     first = (contours[..., :1] + hed[..., :1]) / 2

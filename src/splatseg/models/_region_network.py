@@ -28,8 +28,11 @@ WEIGHTS = Path(__file__).parent / "weights" / "regions.safetensors"
 OUTPUTS = 12
 """Contours of things, parts and HED; thing; left, top, right, bottom of the thing, of the part."""
 
-CONTOURS = 4
-"""Channels of `contours_and_boxes`: half the sum of things' and parts', then the three."""
+CONTOURS = 6
+"""Channels of contours of `contours_and_boxes`."""
+
+ENLARGED = 2.0
+"""Second size that a photograph is seen in, against its own."""
 
 BOX_SCALE = 8.0
 """Pixels at which distances d to a box's sides go from linear to logarithmic: the network gives
@@ -164,14 +167,33 @@ def region_network() -> RegionNetwork:
 @torch.inference_mode()
 def contours_and_boxes(
     network: RegionNetwork, image: UInt8[np.ndarray, "h w 3"]
-) -> tuple[Float[np.ndarray, "h w 4"], Float[np.ndarray, "h w 9"]]:
-    """What the network says of an sRGB image, the mean of it and its mirror image.
+) -> tuple[Float[np.ndarray, "h w 6"], Float[np.ndarray, "h w 9"]]:
+    """What the network says of an sRGB image, and of the image enlarged.
+
+    Enlarged, it sees finer rims; boxes are those of the image as it is.
 
     Returns:
-        Probabilities of contours: half the sum of things' and parts', things', parts', HED's; and
-        the probability of a thing, then left, top, right and bottom in pixels of the image of the
-        box of the thing, and of the part, that each pixel is of.
+        Probabilities of contours: the mean of the others' things and parts; things, parts and
+        HED's of the image; things and parts of the enlarged one. And the probability of a thing,
+        then left, top, right and bottom in pixels of the box of the thing, and of the part, that
+        each pixel is of.
     """
+    import cv2
+
+    height, width = image.shape[:2]
+    found = _predicted(network, image)
+    size = (round(width * ENLARGED), round(height * ENLARGED))
+    enlarged = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_LINEAR), np.uint8)
+    finer = _predicted(network, enlarged)[..., :2]
+    finer = np.asarray(cv2.resize(finer, (width, height), interpolation=cv2.INTER_AREA))
+    together = (found[..., :2].sum(2, keepdims=True) + finer.sum(2, keepdims=True)) / 4
+    contours = np.concatenate((together, found[..., :3], finer), axis=2).astype(np.float32)
+    boxes = _boxes(np.expm1(found[..., 4:]) * np.float32(BOX_SCALE))
+    return contours, np.concatenate((found[..., 3:4], boxes), axis=2)
+
+
+def _predicted(network: RegionNetwork, image: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """(h, w, 12) probabilities and logarithms, the mean of the image and its mirror image."""
     import cv2
 
     height, width = image.shape[:2]
@@ -181,16 +203,12 @@ def contours_and_boxes(
     pixels = pixels.permute(2, 0, 1)[None].contiguous(memory_format=torch.channels_last)
     straight = network(pixels)[0][0]
     mirrored = network(pixels.flip(-1))[0][0].flip(-1)[list(_MIRRORED)]
-    logits, sides = straight[:4], (straight[4:] + mirrored[4:]) / 2
-    probabilities = (logits.sigmoid() + mirrored[:4].sigmoid()) / 2
-    found = torch.cat((probabilities, sides.clamp(0, _FARTHEST))).permute(1, 2, 0).numpy()
+    probabilities = (straight[:4].sigmoid() + mirrored[:4].sigmoid()) / 2
+    sides = ((straight[4:] + mirrored[4:]) / 2).clamp(0, _FARTHEST)
+    found = torch.cat((probabilities, sides)).permute(1, 2, 0).numpy()
     size = (width + beside, height + below)
     large = cv2.resize(np.ascontiguousarray(found), size, interpolation=cv2.INTER_LINEAR)
-    large = np.asarray(large, np.float32)[:height, :width]
-    thing, part = large[..., :1], large[..., 1:2]
-    contours = np.concatenate(((thing + part) / 2, large[..., :3]), axis=2)
-    boxes = _boxes(np.expm1(large[..., 4:]) * np.float32(BOX_SCALE))
-    return contours, np.concatenate((large[..., 3:4], boxes), axis=2)
+    return np.asarray(large, np.float32)[:height, :width]
 
 
 def _boxes(distances: NDArray[np.float32]) -> NDArray[np.float32]:
