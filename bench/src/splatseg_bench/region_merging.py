@@ -76,7 +76,7 @@ class PairRows:
 
 
 def record_pairs(
-    examples: Iterable[Example], pair: Perceptron | None, *, seed: int, share: float = 0.3
+    examples: Iterable[Example], pair: Perceptron | None, *, seed: int, share: float = 0.1
 ) -> PairRows:
     """Merge by what was learned so far, by contours alone at first, and keep what was asked.
 
@@ -118,7 +118,10 @@ def _with_unions(of_basins: Array, tree: Hierarchy) -> Array:
 
 
 def node_rows(examples: Iterable[Example], pair: Perceptron) -> tuple[Array, Array]:
-    """Features (n, f) of candidates, and the IoU (n, 2) with the best part and the best thing."""
+    """Features (n, f) of candidates, and what their perceptron is to say (n, 4).
+
+    The IoU with the best part and the best thing, and twice what each is above a half.
+    """
     found: list[tuple[Array, Array]] = []
     for example in examples:
         nodes = candidates(example.regions, pair)
@@ -127,7 +130,7 @@ def node_rows(examples: Iterable[Example], pair: Perceptron) -> tuple[Array, Arr
         ]
         found.append((nodes.features, np.stack(best, axis=1)))
     features, ious = (np.concatenate(part) for part in zip(*found, strict=True))
-    return features, ious
+    return features, np.concatenate((ious, (2 * ious - 1).clip(0)), axis=1)
 
 
 def best_ious(nodes: Candidates, basins: NDArray[np.int32], ids: Ids) -> Array:

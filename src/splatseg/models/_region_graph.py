@@ -183,7 +183,7 @@ class Perceptron:
         values = np.clip((features - mean) / spread, -_LIMIT, _LIMIT)
         for k, (weights, biases) in enumerate(self.layers):
             values = (np.maximum(values, 0) if k else values) @ weights + biases
-        return 1 / (1 + np.exp(-values))
+        return 1 / (1 + np.exp(-np.clip(values, -80, 80)))
 
     @classmethod
     def of(cls, tensors: Mapping[str, Tensor], prefix: str) -> "Perceptron":

@@ -40,6 +40,11 @@ _AT_ONCE = 256
 REPEATED = 0.6
 """Of candidates whose IoU is larger the better one is taken."""
 
+GOOD_THING = 3
+"""Output of a node's perceptron by which candidates are ordered: of parts and things come the IoU
+with the best one, then twice what it is above a half. A piece of a wall has an IoU with the wall
+that says nothing, as the wall is there too; above a half there is one piece at most."""
+
 KINDS = ("own", "depth", "hed", "hed-depth")
 """Contours that there are perceptrons for: own ones; with those of depth, of HED, of both."""
 
@@ -172,9 +177,8 @@ def masks_of_regions(
     pixels = described(image, contours, predictions)
     found = candidates(regions(pixels), pair)
     fits = node(found.features)
-    taken = select(
-        found, fits[:, THING].astype(np.float64), most=most, least=least * pixels.basins.size
-    )
+    scores = fits[:, GOOD_THING].astype(np.float64)
+    taken = select(found, scores, most=most, least=least * pixels.basins.size)
     height, width = size
     labels = enlarged(pixels.basins.astype(np.int32), height, width)
     masks = encoded(labels, found.members(taken))
@@ -183,7 +187,7 @@ def masks_of_regions(
         height=height,
         width=width,
         masks=tuple(masks),
-        scores=torch.from_numpy(best.max(1).astype(np.float32)),
+        scores=torch.from_numpy(best[:, [PART, THING]].max(1).astype(np.float32)),
         levels=torch.from_numpy((best[:, THING] >= best[:, PART]).astype(np.int32)),
     )
 
