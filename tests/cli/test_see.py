@@ -56,6 +56,26 @@ def refused(result: tuple[int, str, str]) -> str:
     return errors[0]
 
 
+# The regions that come with the package
+
+
+def test_regions_see_with_the_scene_s_depth_or_without(small, splatseg) -> None:
+    see = ("see", small.scene, "--model", "regions", "--evidence")
+    for name, flags in (("plain", ()), ("deep", ("--depth-from-scene",))):
+        status, out, err = splatseg(*see, name, *flags)
+        assert status == 0, err
+        assert out.startswith("masks of 3 views by regions, ")
+        assert "on no photograph" in err
+    settings = [header(small.scene / "evidence" / name)["metadata"]["settings"]
+                for name in ("plain", "deep")]  # fmt: skip
+    assert "depth_from_scene" not in settings[0]
+    assert settings[1]["depth_from_scene"] is True
+    assert "depth_from_scene" in refused(splatseg(*see, "deep"))
+    message = refused(splatseg("see", small.scene, *CLASSICAL, "--depth-from-scene"))
+    assert "depth_from_scene: expected a model that takes depth, got 'classical'" in message
+    assert not (small.scene / "evidence" / "masks").exists()
+
+
 # The classical stand-in
 
 

@@ -20,10 +20,9 @@ from splatseg.errors import (
 )
 from splatseg.io.evidence import evidence_header, open_evidence
 from splatseg.models import LoadOptions, find_family, find_model, record_evidence
-from splatseg.models._regions import nested_masks, region_masks
 from splatseg.models._weights import digest_of, installed_weights
-from splatseg.models.classical import ClassicalOptions
 from splatseg.models.hed import CHANNELS, SCALES, Hed, HedNetwork, read_network
+from splatseg.models.regions import RegionOptions, learned_masks
 from support.checkpoints_hed import DEPTHS, WIDTHS, shapes, tensors, write
 
 MEAN = np.array([103.939, 116.779, 123.68])
@@ -156,24 +155,22 @@ def test_images_together_are_as_one_by_one_and_as_before(weights: Path, rng) -> 
     assert 0 < float(np.abs(rounded - alone[0]).max()) < 0.2
 
 
-def test_masks_are_what_contours_enclose(squares) -> None:
-    """Drawn contours around half of a plain square: no colour shows there, and a mask does."""
-    plain = torch.full((96, 128, 3), 120, dtype=torch.uint8)
-    drawn = np.zeros((96, 128, CHANNELS), np.float32)
-    cv2.rectangle(contour := np.zeros((96, 128), np.float32), (40, 30), (80, 60), 1.0, 2)
-    drawn[..., 0] = contour
-    wanted = torch.zeros(96, 128, dtype=torch.bool)
-    wanted[30:61, 40:81] = True
-    masks = nested_masks(plain, drawn)
-    ious = [
-        float((masks.dense(i) & wanted).sum() / (masks.dense(i) | wanted).sum())
-        for i in range(len(masks))
-    ]
-    assert max(ious) > 0.85
-    assert float(masks.scores[int(np.argmax(ious))]) > 0.5
-    assert len(nested_masks(plain, np.zeros_like(drawn))) == len(region_masks(plain))
-    half = nested_masks(squares, cv2.resize(drawn, (64, 48)))
-    assert (half.height, half.width) == (96, 128)
+def test_masks_are_those_of_its_contours(weights: Path, rng) -> None:
+    picture = image(rng, 48, 64)
+    model = made(weights)
+    contours = model.contours(picture)
+    depth = torch.where(torch.arange(64) < 30, 1.0, 3.0).expand(48, 64)
+    for found, wanted in (
+        (model.masks(picture), learned_masks(picture, hed=contours)),
+        (
+            model.masks_with_depth(picture, depth, 60.0),
+            learned_masks(picture, hed=contours, depth=depth, focal=60.0),
+        ),
+    ):
+        counts = [[mask.counts.tolist() for mask in one.masks] for one in (found, wanted)]
+        assert counts[0] == counts[1]
+        assert counts[0]
+    assert len(made(weights, RegionOptions(max_masks=2)).masks(picture)) <= 2
 
 
 def test_settings_tell_answers_apart(weights: Path, tmp_path) -> None:
@@ -185,7 +182,7 @@ def test_settings_tell_answers_apart(weights: Path, tmp_path) -> None:
     content["fuse/vars/1"] += 1
     other = made(write(tmp_path / "other.h5", content))
     assert other.settings["weights"] != model.settings["weights"]
-    coarse = made(weights, ClassicalOptions(cuts=(0.3, 0.6)))
+    coarse = made(weights, RegionOptions(max_masks=7))
     assert coarse.settings != model.settings == coarse.default_settings
     copy = shutil.copy(weights, tmp_path / "renamed.h5")
     assert made(copy).settings == model.settings, "by content, not by name"
@@ -201,8 +198,8 @@ def test_a_second_run_goes_on(weights: Path, views, tmp_path) -> None:
     assert len(open_evidence(folder).view_names) == 3
     recorded = evidence_header(folder)["metadata"]["settings"]
     assert recorded["weights"] == digest_of(weights)
-    with pytest.raises(InputError, match="cuts"):
-        record_evidence(made(weights, ClassicalOptions(cuts=(0.3,))), views, folder)
+    with pytest.raises(InputError, match="max_masks"):
+        record_evidence(made(weights, RegionOptions(max_masks=7)), views, folder)
 
 
 # The file

@@ -165,7 +165,9 @@ def record_evidence(
     questions = _distinct(request.what)
     pictures = Pictures(request.image_of)
     if request.depth_of is not None and not isinstance(model, DepthAwareMasks):
-        raise InputError(f"depth: expected a model that takes depth, got {model.name!r}.")
+        raise InputError(
+            f"depth_from_scene: expected a model that takes depth, got {model.name!r}."
+        )
     writers = _writers(model, views, questions, request, pictures)
     folder = Path(folder)
     folders = [folder, *(folder.with_name(f"{folder.name}.{one}") for one in questions[1:])]
