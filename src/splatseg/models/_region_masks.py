@@ -188,7 +188,7 @@ def masks_of_regions(
         width=width,
         masks=tuple(masks),
         scores=torch.from_numpy(best[:, [PART, THING]].max(1).astype(np.float32)),
-        levels=torch.from_numpy((best[:, THING] >= best[:, PART]).astype(np.int32)),
+        levels=torch.zeros(len(masks), dtype=torch.int32),
     )
 
 

@@ -101,7 +101,7 @@ def learned_masks(
 
     Returns:
         Masks in the image's own pixels. A score is the predicted IoU with a true thing or part,
-        whichever is larger; level 0 are masks that are rather parts, level 1 rather things.
+        whichever is larger. Masks have no levels: parts and things are told apart by all views.
     """
     height, width = (int(side) for side in image.shape[:2])
     with one_thread(), network_inference():
