@@ -54,6 +54,7 @@ SLOW = (
     "importing.",
     "models.record_evidence",
     "models.classical.region_masks",
+    "models.regions.learned_masks",
     "models.classical.colour_gradient_features",
     "synthetic.",
     "evaluate.evaluate_",

@@ -9,7 +9,9 @@ import pytest
 import torch
 from PIL import Image
 
+from splatseg import tasks
 from splatseg.core import FeatureMap, LabelMap, MaskSet, Panoptic, Segment
+from splatseg.errors import InputError
 from splatseg.io.evidence import (
     PanopticEvidence,
     TrackedEvidence,
@@ -72,8 +74,11 @@ def test_regions_see_with_the_scene_s_depth_or_without(small, splatseg) -> None:
     assert settings[1]["depth_from_scene"] is True
     assert "depth_from_scene" in refused(splatseg(*see, "deep"))
     message = refused(splatseg("see", small.scene, *CLASSICAL, "--depth-from-scene"))
-    assert "depth_from_scene: expected a model that takes depth, got 'classical'" in message
-    assert not (small.scene / "evidence" / "masks").exists()
+    assert "--depth-from-scene" in message
+    options = tasks.SeeOptions(depth_from_scene=True)
+    with pytest.raises(InputError, match="depth_from_scene: expected a model that takes depth"):
+        tasks.see(load_scene(small.scene), "classical", "m", options=options)
+    assert not (small.scene / "evidence" / "m").exists()
 
 
 # The classical stand-in

@@ -376,6 +376,7 @@ def special(world: World, by_type: dict[type, Any]) -> dict[str, Any]:
         "methods.find_method.name": "uplift",
         "models.classical.colour_gradient_features.image": byte,
         "models.classical.region_masks.image": byte,
+        "models.regions.learned_masks.image": byte,
         "models.classical.grab_cut.image": byte.numpy(),
         "models.classical.grab_cut.size": (HEIGHT, WIDTH),
         "models.classical.partition.level": 0,

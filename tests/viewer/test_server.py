@@ -603,7 +603,7 @@ def test_what_is_at_hand_makes_masks(things, monkeypatch) -> None:
 
     monkeypatch.setattr(models, "find_model", find)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    assert _job_process._model_at_hand() == "classical"
+    assert _job_process._model_at_hand() == "regions"
     assert asked == []
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     assert _job_process._model_at_hand() == "the model"

@@ -32,7 +32,7 @@ class Command(OnScene):
 
     For example:
 
-    splatseg see room --model classical --evidence masks
+    splatseg see room --model regions --evidence masks
 
     splatseg see room --model dinov2 --weights facebook/dinov2-base --download --evidence dino
 
@@ -73,25 +73,23 @@ _HIDDEN_LOADING = (
 )
 """For a model that has no weights: their flags are unknown to it, and so refused."""
 
-_Untracked = make_dataclass(
-    "Untracked",
-    [
-        ("seeds", Annotated[str | None, tyro.conf.Suppress], None),
-        (
-            "tracking",
-            Annotated[TrackingOptions, tyro.conf.Suppress],
-            field(default_factory=TrackingOptions),
-        ),
-    ],
-    bases=(SeeOptions,),
-    frozen=True,
-    kw_only=True,
+_TRACKING: tuple[Any, ...] = (
+    ("seeds", Annotated[str | None, tyro.conf.Suppress], None),
+    (
+        "tracking",
+        Annotated[TrackingOptions, tyro.conf.Suppress],
+        field(default_factory=TrackingOptions),
+    ),
 )
+_DEPTH: tuple[Any, ...] = (("depth_from_scene", Annotated[bool, tyro.conf.Suppress], False),)
 
-_NO_TRACKING = (
-    "seeing", tyro.conf.OmitArgPrefixes[_Untracked], field(default_factory=_Untracked)
-)  # fmt: skip
-"""For a model that tracks nothing."""
+
+def _seeing(*, tracks: bool, takes_depth: bool) -> Any:
+    """The options of what is seen, without those that the model has no use for."""
+    hidden = [*(() if tracks else _TRACKING), *(() if takes_depth else _DEPTH)]
+    made: Any = make_dataclass("Seeing", hidden, bases=(SeeOptions,), frozen=True, kw_only=True)
+    return ("seeing", tyro.conf.OmitArgPrefixes[made], field(default_factory=made))
+
 
 _NO_OPTIONS = ("options", Annotated[Any, tyro.conf.Suppress], field(default=None))
 
@@ -105,7 +103,8 @@ def command_for(words: Sequence[str]) -> type[Any]:
     if name is None:
         return _with_summaries()
     if name not in model_names():
-        return _made([_NO_OPTIONS, _HIDDEN_LOADING, _NO_TRACKING], Command.__doc__)
+        seeing = _seeing(tracks=False, takes_depth=False)
+        return _made([_NO_OPTIONS, _HIDDEN_LOADING, seeing], Command.__doc__)
     family = find_family(name)
     if family is None:
         return _made([_NO_OPTIONS, _HIDDEN_LOADING], Command.__doc__)
@@ -114,9 +113,10 @@ def command_for(words: Sequence[str]) -> type[Any]:
         tyro.conf.OmitArgPrefixes,
         tyro.conf.arg(help=f"Options of model {name}: {family.summary} ({family.reference})."),
     ]
-    fields: list[Any] = [("options", options, field(default_factory=family.options))]
-    if "tracked" not in family.gives:
-        fields.append(_NO_TRACKING)
+    fields: list[Any] = [
+        ("options", options, field(default_factory=family.options)),
+        _seeing(tracks="tracked" in family.gives, takes_depth=family.takes_depth),
+    ]
     if not family.needs_weights:
         fields.append(_HIDDEN_LOADING)
     return _made(fields, f"{Command.__doc__}{_weights(family)}")
@@ -149,7 +149,8 @@ def _with_summaries() -> type[Any]:
         f"- {name}: {model_summary(name) or 'of another package'}" for name in model_names()
     )
     return _made(
-        [_NO_OPTIONS, _HIDDEN_LOADING, _NO_TRACKING], f"{Command.__doc__}\n\nModels:\n\n{text}"
+        [_NO_OPTIONS, _HIDDEN_LOADING, _seeing(tracks=False, takes_depth=False)],
+        f"{Command.__doc__}\n\nModels:\n\n{text}",
     )
 
 

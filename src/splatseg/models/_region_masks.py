@@ -31,7 +31,7 @@ from splatseg.models._region_graph import (
 from splatseg.models._region_network import weights
 from splatseg.models._regions import enlarged
 
-SMALLEST = 250 / (512 * 384)
+SMALLEST = 80 / (512 * 384)
 """Share of the image that a candidate has at least; that of the training."""
 
 _AT_ONCE = 256
@@ -205,8 +205,19 @@ def with_hed(contours: Array, hed: Array) -> Array:
     return np.concatenate((first, contours, hed), axis=2).astype(np.float32)
 
 
+_DEPTH_SHARE = 0.3
+"""Share of steps and folds in the contour whose basins are the regions: what colours hide has a
+rim there too."""
+
 _STEP, _SHORT = 0.03, 3
 """Bend of the inverse depth, against itself, that counts as half a step, over pixels either way."""
+
+
+def with_depth(contours: Array, depth: Array, focal: float) -> Array:
+    """Contours with those of a depth map, as the perceptrons "depth" and "hed-depth" take them."""
+    found = depth_contours(depth, focal)
+    first = contours[..., :1] + np.float32(_DEPTH_SHARE) * found.max(axis=2, keepdims=True)
+    return np.concatenate((first.clip(0, 1), contours[..., 1:], found), axis=2).astype(np.float32)
 
 
 def depth_contours(depth: Array, focal: float) -> Array:

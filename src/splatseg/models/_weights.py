@@ -167,6 +167,9 @@ class ModelFamily:
     instead: str = ""
     """What serves where its weights are not to be had; a clause, lower case."""
 
+    takes_depth: bool = False
+    """Whether its masks go by the depth of a scene too, where there is some: `DepthAwareMasks`."""
+
     @property
     def needs_weights(self) -> bool:
         """Whether a model of it has weights."""

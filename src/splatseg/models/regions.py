@@ -14,10 +14,9 @@ from splatseg.core import MaskSet
 from splatseg.core.boundary import boundary
 from splatseg.core.models import Image
 from splatseg.core.options import Count, Share, options
-from splatseg.core.threads import network_inference
 from splatseg.errors import ShapeError
 from splatseg.models._merge_tree import one_thread
-from splatseg.models._region_masks import depth_contours, masks_of_regions, with_hed
+from splatseg.models._region_masks import masks_of_regions, with_depth, with_hed
 from splatseg.models._region_network import contours_and_boxes, region_network
 from splatseg.models._regions import WORKING_SIZE, reduced
 
@@ -104,7 +103,8 @@ def learned_masks(
         whichever is larger. Masks have no levels: parts and things are told apart by all views.
     """
     height, width = (int(side) for side in image.shape[:2])
-    with one_thread(), network_inference():
+    # Torch has one thread in here, so that masks do not depend on how many there are.
+    with one_thread():
         size = WORKING_SIZE if hed is None else max(hed.shape[:2])
         small = np.asarray(reduced(image, size), np.uint8)
         contours, predictions = contours_and_boxes(region_network(), small)
@@ -118,8 +118,7 @@ def learned_masks(
         check_range("focal", focal, 1e-3, 1e9)
         kind = "depth" if hed is None else "hed-depth"
         less = small.shape[1] / width
-        steps = depth_contours(_resized_depth(depth, small.shape[:2]), focal * less)
-        contours = np.concatenate((contours, steps), axis=2)
+        contours = with_depth(contours, _resized_depth(depth, small.shape[:2]), focal * less)
     chosen = options or RegionOptions()
     return masks_of_regions(
         small, contours, predictions, size=(height, width), kind=kind,

@@ -188,8 +188,8 @@ class _MainJob:
         scene = load_scene(root)
         truth = {_LAYER: capture / "semantic", _OBJECTS: capture / "instance"}
         self._segment(scene, "uplift", _EVIDENCE, _LAYER, truth[_LAYER])
-        with self._step("see", root, "--model", "classical", "--evidence", _MASKS):
-            see(scene, "classical", _MASKS, observer=observer)
+        with self._step("see", root, "--model", "regions", "--evidence", _MASKS):
+            see(scene, "regions", _MASKS, observer=observer)
         self._segment(scene, "associate", _MASKS, _OBJECTS, truth[_OBJECTS])
         what = ("rgb", "depth", _LAYER, _OBJECTS)
         with self._step("render", root, "--what", ",".join(what), "-o", folder / "render"):
