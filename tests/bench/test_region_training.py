@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from splatseg.models._region_graph import described, merge, regions
+from splatseg.models._region_masks import candidates
 from splatseg_bench.region_merging import (
     Example,
     as_rendered,
@@ -154,17 +155,19 @@ def test_merging_learns_what_is_one_part_and_one_thing() -> None:
     assert len(rare.features) < 0.5 * len(rows.features) / 4
 
 
-def test_what_is_smaller_than_any_candidate_counts_for_nothing() -> None:
+def test_what_is_smaller_than_any_candidate_counts_for_nothing(monkeypatch) -> None:
     one = example()
     tiny = one.part.copy()
     tiny[0, 0] = 9
+    met = record_pairs([one], None, seed=0)
     pair = fit(
-        *(lambda r: (r.features, r.answers, r.weights))(record_pairs([one], None, seed=0)),
+        met.features, met.answers, met.weights,
         hidden=(4,), steps=20, seed=0, report=lambda text: None, batch=64,
     )  # fmt: skip
-    from splatseg.models._region_masks import candidates
-
-    ious = best_ious(candidates(one.regions, pair), one.basins, tiny)
+    nodes = candidates(one.regions, pair)
+    assert (best_ious(nodes, one.basins, tiny)[:, -1] > 0).any()
+    monkeypatch.setattr("splatseg_bench.region_merging.SMALLEST", 2 / tiny.size)
+    ious = best_ious(nodes, one.basins, tiny)
     assert (ious[:, -1] == 0).all()
     assert (ious[:, 0] > 0).any()
 

@@ -28,10 +28,10 @@ ALGORITHM = 1
 class RegionOptions:
     """Which regions of an image become masks."""
 
-    max_masks: Count = 150
+    max_masks: Count = 250
     """Masks a photograph at most; the best are kept."""
 
-    min_area: Share = 0.0015
+    min_area: Share = 0.0005
     """Masks smaller than this share of the image are dropped."""
 
 
