@@ -23,7 +23,7 @@ from splatseg.core import (
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.models import _regions, classical, find_model
 from splatseg.models._merge_tree import merge_tree, pixel_features
-from splatseg.models._regions import _enlarged
+from splatseg.models._regions import enlarged
 from splatseg.models.classical import (
     Classical,
     ClassicalOptions,
@@ -122,14 +122,14 @@ def test_masks_keep_the_photographs_size_and_outline(squares, monkeypatch) -> No
 def test_enlarged_borders_are_straight_and_labels_stay_labels() -> None:
     """A diagonal at a quarter of the size stays within half a pixel of the line it stands for."""
     small = (np.arange(40)[:, None] < np.arange(40)[None]).astype(np.int32) * 7
-    large = _enlarged(small, 160, 160)
+    large = enlarged(small, 160, 160)
     assert set(np.unique(large).tolist()) == {0, 7}
     first = np.argmax(large == 7, axis=1)[20:140]
     steps = np.diff(first)
     assert set(steps.tolist()) <= {0, 1, 2}, "nearest would give 0, 0, 0, 4"
     ids = np.arange(12, dtype=np.int32).reshape(3, 4)
-    assert np.array_equal(_enlarged(ids, 3, 4), ids)
-    assert np.array_equal(_enlarged(ids, 9, 12)[1::3, 1::3], ids)
+    assert np.array_equal(enlarged(ids, 3, 4), ids)
+    assert np.array_equal(enlarged(ids, 9, 12)[1::3, 1::3], ids)
 
 
 def test_small_masks_are_dropped(squares) -> None:
