@@ -105,12 +105,14 @@ def test_masks_are_things_and_the_same_again(squares) -> None:
 
 
 def test_options_say_how_many_masks_and_how_small(squares) -> None:
-    everything = learned_masks(squares, RegionOptions(max_masks=400, min_area=0.0))
-    few = learned_masks(squares, RegionOptions(max_masks=3, min_area=0.0))
+    everything = learned_masks(squares, RegionOptions(max_masks=400, min_area=0.0, min_score=0.0))
+    few = learned_masks(squares, RegionOptions(max_masks=3, min_area=0.0, min_score=0.0))
     assert len(few) == 3 < len(everything)
     first = [mask.counts.tolist() for mask in everything.masks[:3]]
     assert [mask.counts.tolist() for mask in few.masks] == first
-    large = learned_masks(squares, RegionOptions(min_area=0.05))
+    sure = learned_masks(squares, RegionOptions(max_masks=400, min_area=0.0, min_score=0.5))
+    assert 0 < len(sure) == int((everything.scores >= 0.5).sum()) < len(everything)
+    large = learned_masks(squares, RegionOptions(min_area=0.05, min_score=0.0))
     assert min(mask.area for mask in large.masks) >= 0.04 * 96 * 128
     assert min(mask.area for mask in everything.masks) < 0.05 * 96 * 128
     with pytest.raises(InputError, match="max_masks"):
@@ -153,14 +155,15 @@ def test_depth_shows_what_colours_hide() -> None:
         learned_masks(grey, hed=np.zeros((95, 128, 9), np.float32))
 
 
-def test_hed_s_contours_count(squares) -> None:
+def test_hed_s_contours_count() -> None:
+    every = RegionOptions(min_score=0.0)
     grey = torch.full((96, 128, 3), 128, dtype=torch.uint8)
     hed = np.zeros((96, 128, 9), np.float32)
     hed[28:32, 38:92] = hed[68:72, 38:92] = hed[28:72, 38:42] = hed[28:72, 88:92] = 0.9
     wanted = torch.zeros(96, 128, dtype=torch.bool)
     wanted[30:70, 40:90] = True
-    assert best(learned_masks(grey, hed=hed), wanted) > 0.7
+    assert best(learned_masks(grey, every, hed=hed), wanted) > 0.7
     depth = torch.where(wanted, 1.0, 2.0)
-    both = learned_masks(grey, hed=hed, depth=depth, focal=100.0)
+    both = learned_masks(grey, every, hed=hed, depth=depth, focal=100.0)
     assert best(both, wanted) > 0.7
-    assert not same(both, learned_masks(grey, hed=hed))
+    assert not same(both, learned_masks(grey, every, hed=hed))

@@ -160,6 +160,7 @@ def masks_of_regions(
     kind: str,
     most: int,
     least: float,
+    min_score: float,
 ) -> MaskSet:
     """Masks of an image by contours and predictions, as `described` takes them.
 
@@ -171,6 +172,7 @@ def masks_of_regions(
         kind: Of the contours.
         most: Masks.
         least: Share of the image that a mask has.
+        min_score: IoU with a true part or thing that is expected of a mask.
     """
     tensors = weights()
     pair, node = (Perceptron.of(tensors, f"{kind}.{of}.") for of in ("pair", "node"))
@@ -179,6 +181,7 @@ def masks_of_regions(
     fits = node(found.features)
     scores = fits[:, GOOD_THING].astype(np.float64)
     taken = select(found, scores, most=most, least=least * pixels.basins.size)
+    taken = taken[fits[taken][:, [PART, THING]].max(1) >= min_score]
     height, width = size
     labels = enlarged(pixels.basins.astype(np.int32), height, width)
     masks = encoded(labels, found.members(taken))

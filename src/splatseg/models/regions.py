@@ -34,6 +34,9 @@ class RegionOptions:
     min_area: Share = 0.0005
     """Masks smaller than this share of the image are dropped."""
 
+    min_score: Share = 0.3
+    """Masks whose expected IoU with a true thing or part is less are dropped."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Regions:
@@ -122,7 +125,7 @@ def learned_masks(
     chosen = options or RegionOptions()
     return masks_of_regions(
         small, contours, predictions, size=(height, width), kind=kind,
-        most=chosen.max_masks, least=chosen.min_area,
+        most=chosen.max_masks, least=chosen.min_area, min_score=chosen.min_score,
     )  # fmt: skip
 
 
