@@ -47,7 +47,8 @@ class Recipe:
     textured: float = 0.5
     """Share of crops whose parts get a random texture each."""
     printed: float = 0.0
-    """Share of parts that show a piece of another picture, as posters, screens and plaids do."""
+    """Share of parts that show a piece of another picture, as posters, screens and plaids do; the
+    weights that are shipped have met them in merging alone."""
 
 
 def train(
