@@ -13,10 +13,10 @@ from splatseg.models._region_masks import (
     Candidates,
     candidates,
     depth_contours,
-    encoded,
     select,
     with_hed,
 )
+from splatseg.models._regions import encoded
 from support.region_reference import Merging
 
 

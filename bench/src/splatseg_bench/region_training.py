@@ -3,6 +3,7 @@
 import zlib
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -268,6 +269,7 @@ def _boxes(ids: Ids) -> tuple[Array, Array]:
     return np.log1p(distances.clip(0) / BOX_SCALE), weights / weights.mean()
 
 
+@cache
 def noises(seed: int, count: int = 24, side: int = 320) -> Array:
     """(count, side, side) noises of mean 0 and deviation 1 whose spectra fall by 1/f to 1/f^2."""
     rng = np.random.default_rng(seed)

@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 Array = NDArray[np.float32]
 
 # Bins of CIE Lab, in its own units. Colours indoors and outdoors lie near grey: +-48 holds them.
-_L_BINS = np.linspace(0.0, 100.0, 13, dtype=np.float32)
-_AB_BINS = np.linspace(-48.0, 48.0, 17, dtype=np.float32)
+L_BINS = np.linspace(0.0, 100.0, 13, dtype=np.float32)
+AB_BINS = np.linspace(-48.0, 48.0, 17, dtype=np.float32)
 _TEXTURE_SCALE = 12.0
 """Gradient energy, in units of L, at which a texture channel is half full."""
 
@@ -74,9 +74,9 @@ def pixel_features(image: NDArray[np.uint8], *, strength: Array | None = None) -
     lab = _blur(raw, 1.0)
     bins = np.concatenate(
         (
-            _soft_bins(lab[..., 0], _L_BINS),
-            _soft_bins(lab[..., 1], _AB_BINS),
-            _soft_bins(lab[..., 2], _AB_BINS),
+            soft_bins(lab[..., 0], L_BINS),
+            soft_bins(lab[..., 1], AB_BINS),
+            soft_bins(lab[..., 2], AB_BINS),
         ),
         axis=2,
     )
@@ -131,7 +131,7 @@ def _texture(lightness: Array) -> Array:
     return (energy / (energy + _TEXTURE_SCALE)).astype(np.float32)
 
 
-def _soft_bins(values: Array, centres: Array) -> Array:
+def soft_bins(values: Array, centres: Array) -> Array:
     """Linear interpolation into bins: at most two per pixel are filled, and sum to 1."""
     step = centres[1] - centres[0]
     position = np.clip((values - centres[0]) / step, 0, len(centres) - 1)

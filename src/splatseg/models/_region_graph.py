@@ -15,15 +15,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splatseg import _native
-from splatseg.models._merge_tree import one_thread
+from splatseg.models._merge_tree import AB_BINS, L_BINS, one_thread, soft_bins
 
 Array = NDArray[np.float32]
 Floats = NDArray[np.float64]
 Rows = NDArray[np.int64]
-
-_L_BINS = np.linspace(0.0, 100.0, 13, dtype=np.float32)
-_AB_BINS = np.linspace(-48.0, 48.0, 17, dtype=np.float32)
-"""Bins of CIE Lab, in its own units. Colours of scenes lie near grey: +-48 holds them."""
 
 _COLOUR_SCALE = 25.0
 """Units of Lab that a spread of colour is given in."""
@@ -113,9 +109,9 @@ def described(
         *(np.asarray(one / (one + _TEXTURE_SCALE), np.float32)[..., None] for one in energy),
         contours[..., :1],
         gradients[0][..., None],
-        _soft_bins(lab[..., 0], _L_BINS),
-        _soft_bins(lab[..., 1], _AB_BINS),
-        _soft_bins(lab[..., 2], _AB_BINS),
+        soft_bins(lab[..., 0], L_BINS),
+        soft_bins(lab[..., 1], AB_BINS),
+        soft_bins(lab[..., 2], AB_BINS),
     ]
     if predictions is not None:
         planes += [predictions, predictions[..., 1:] ** 2]
@@ -141,14 +137,6 @@ def _gradient(lab: Array, sigma: float) -> Array:
         xx, yy, xy = xx + dx * dx, yy + dy * dy, xy + dx * dy
     root = np.sqrt((xx - yy) ** 2 + 4 * xy * xy)
     return np.sqrt(np.maximum((xx + yy + root) / 2, 0)).astype(np.float32)
-
-
-def _soft_bins(values: Array, centres: Array) -> Array:
-    """Linear interpolation into bins: at most two per pixel are filled, and sum to 1."""
-    step = centres[1] - centres[0]
-    position = np.clip((values - centres[0]) / step, 0, len(centres) - 1)
-    distance = np.abs(position[..., None] - np.arange(len(centres), dtype=np.float32))
-    return np.maximum(1 - distance, 0).astype(np.float32)
 
 
 def _basins(ridge: Array) -> NDArray[np.int64]:

@@ -8,13 +8,14 @@ with exact truth (`scripts/train_regions`), on no photograph.
 """
 
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from splatseg.core import MaskSet, Rle
+from splatseg.core import MaskSet
 from splatseg.models._merge_tree import one_thread
 from splatseg.models._region_graph import (
     PART,
@@ -29,7 +30,7 @@ from splatseg.models._region_graph import (
     regions,
 )
 from splatseg.models._region_network import weights
-from splatseg.models._regions import enlarged
+from splatseg.models._regions import encoded, enlarged
 
 SMALLEST = 80 / (512 * 384)
 """Share of the image that a candidate has at least; that of the training."""
@@ -151,6 +152,13 @@ def select(found: Candidates, scores: Floats, *, most: int, least: float) -> Row
     return np.array(taken, np.int64)
 
 
+@cache
+def _perceptrons(kind: str) -> tuple[Perceptron, Perceptron]:
+    """Of pairs and of nodes."""
+    tensors = weights()
+    return Perceptron.of(tensors, f"{kind}.pair."), Perceptron.of(tensors, f"{kind}.node.")
+
+
 def masks_of_regions(
     image: NDArray[np.uint8],
     contours: Array,
@@ -174,8 +182,7 @@ def masks_of_regions(
         least: Share of the image that a mask has.
         min_score: IoU with a true part or thing that is expected of a mask.
     """
-    tensors = weights()
-    pair, node = (Perceptron.of(tensors, f"{kind}.{of}.") for of in ("pair", "node"))
+    pair, node = _perceptrons(kind)
     pixels = described(image, contours, predictions)
     found = candidates(regions(pixels), pair)
     fits = node(found.features)
@@ -265,24 +272,3 @@ def _either_way(plane: NDArray[Any]) -> tuple[tuple[Any, Any], tuple[Any, Any]]:
     columns = np.pad(plane, ((0, 0), (_SHORT, _SHORT), *wide), mode="edge")
     end = 2 * _SHORT
     return (columns[:, :-end], columns[:, end:]), (rows[:-end], rows[end:])
-
-
-def encoded(labels: NDArray[np.int32], members: NDArray[np.bool_]) -> list[Rle]:
-    """Run lengths of unions of regions, from the runs of the regions: no mask is ever dense.
-
-    Args:
-        labels: (h, w) regions.
-        members: (k, regions) which ones each union holds.
-    """
-    height, width = labels.shape
-    flat = labels.T.reshape(-1)
-    starts = np.concatenate(([0], np.flatnonzero(flat[1:] != flat[:-1]) + 1))
-    found: list[Rle] = []
-    for inside in members:
-        runs = inside[flat[starts]]
-        changes = np.flatnonzero(runs[1:] != runs[:-1]) + 1
-        counts = np.diff(np.concatenate(([0], starts[changes], [flat.size]))).astype(np.uint32)
-        if runs[0]:
-            counts = np.concatenate((np.zeros(1, np.uint32), counts))
-        found.append(Rle(height=height, width=width, counts=counts))
-    return found

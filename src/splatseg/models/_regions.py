@@ -1,5 +1,7 @@
 """Masks without weights: superpixels, merged into ever larger regions, cut at several levels."""
 
+from collections.abc import Iterable
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -216,20 +218,33 @@ def _between(
 
 
 def _encode(labels: NDArray[np.int32], tree: MergeTree, nodes: list[int]) -> list[Rle]:
-    """Run lengths of each node, from the runs of the superpixels: no mask is ever dense."""
+    """Run lengths of each node."""
+    members = tree.members(nodes)
+
+    def inside(node: int) -> NDArray[np.bool_]:
+        found = np.zeros(tree.leaves + 1, np.bool_)
+        found[members[node]] = True
+        return found
+
+    return encoded(labels, map(inside, nodes))
+
+
+def encoded(labels: NDArray[np.int32], members: Iterable[NDArray[np.bool_]]) -> list[Rle]:
+    """Run lengths of unions of regions, from the runs of the regions: no mask is ever dense.
+
+    Args:
+        labels: (h, w) regions.
+        members: Of each union, (regions,): which ones it holds.
+    """
     height, width = labels.shape
     flat = labels.T.reshape(-1)
     starts = np.concatenate(([0], np.flatnonzero(flat[1:] != flat[:-1]) + 1))
     run_labels = flat[starts]
-    members = tree.members(nodes)
     found: list[Rle] = []
-    for node in nodes:
-        inside = np.zeros(tree.leaves + 1, bool)
-        inside[members[node]] = True
+    for inside in members:
         runs = inside[run_labels]
         changes = np.flatnonzero(runs[1:] != runs[:-1]) + 1
-        edges = np.concatenate(([0], starts[changes], [flat.size]))
-        counts = np.diff(edges).astype(np.uint32)
+        counts = np.diff(np.concatenate(([0], starts[changes], [flat.size]))).astype(np.uint32)
         if runs[0]:
             counts = np.concatenate((np.zeros(1, np.uint32), counts))
         found.append(Rle(height=height, width=width, counts=counts))
