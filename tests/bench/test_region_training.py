@@ -20,8 +20,10 @@ from splatseg_bench.region_merging import (
 )
 from splatseg_bench.region_pictures import HEIGHT, WIDTH, Picture, draw_pictures, read_picture
 from splatseg_bench.region_training import (
+    Batches,
     Recipe,
     as_photograph,
+    dense,
     noises,
     photographed,
     train,
@@ -34,7 +36,7 @@ from splatseg_bench.worlds import clutter
 def drawn(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Two pictures of a table."""
     folder = tmp_path_factory.mktemp("pictures")
-    return list(draw_pictures(folder, rooms=0, tables=1, per_scene=2))
+    return draw_pictures(folder, "table", 0, 2)
 
 
 def test_a_table_has_things_of_several_solids_and_is_drawn_by_its_seed() -> None:
@@ -62,7 +64,7 @@ def test_pictures_have_exact_truth_and_are_not_drawn_twice(drawn: list[Path]) ->
         assert instance == solids[part - 1]
         assert (picture.thing[inside] == kinds[scene.objects[instance - 1].class_id]).all()
     assert (picture.depth > 0).all()
-    assert list(draw_pictures(drawn[0].parent, rooms=0, tables=1, per_scene=2)) == []
+    assert draw_pictures(drawn[0].parent, "table", 0, 2) == []
 
 
 def test_training_goes_on_as_if_it_had_not_stopped(drawn: list[Path], tmp_path) -> None:
@@ -70,7 +72,7 @@ def test_training_goes_on_as_if_it_had_not_stopped(drawn: list[Path], tmp_path) 
     recipe = Recipe(steps=3, crops=2, printed=0.3)
     whole, parts = tmp_path / "whole.pt", tmp_path / "parts.pt"
     train(drawn, recipe, whole, said.append)
-    train(drawn, replace(recipe, steps=3), parts, said.append)
+    train(drawn, recipe, parts, said.append, workers=2)
     state = torch.load(whole, weights_only=True)
     assert state["step"] == 3
     again = torch.load(parts, weights_only=True)
@@ -81,9 +83,25 @@ def test_training_goes_on_as_if_it_had_not_stopped(drawn: list[Path], tmp_path) 
     assert torch.load(parts, weights_only=True)["step"] == 3
     with pytest.raises(ValueError, match="of another recipe"):
         train(drawn, replace(recipe, rate=1e-4), parts, said.append)
-    second = tmp_path / "second.pt"
-    train(drawn, replace(recipe, steps=0), second, said.append, start=whole)
-    assert not second.exists(), "nothing to do"
+
+
+def test_a_step_has_crops_of_its_own_number(drawn: list[Path]) -> None:
+    recipe = Recipe(steps=4, crops=2, printed=0.5)
+    at_once, later = (Batches(drawn, recipe, k, preloaded=k > 0) for k in (0, 2))
+    assert (len(at_once), len(later)) == (4, 2)
+    for one, other in zip(at_once[2], later[0], strict=True):
+        assert torch.equal(one, other)
+    assert not torch.equal(at_once[0][0], at_once[1][0])
+    with pytest.raises(IndexError):
+        at_once[4]
+
+
+def test_ids_are_numbered_as_unique_numbers_them(rng) -> None:
+    ids = rng.choice([0, 3, 4, 90], (20, 30)).astype(np.int32)
+    values, labels = np.unique(ids, return_inverse=True)
+    found, count = dense(ids)
+    assert count == len(values)
+    assert np.array_equal(found, labels.reshape(ids.shape))
 
 
 def test_photographs_of_a_picture_change_its_colours_alone(drawn: list[Path], rng) -> None:

@@ -21,6 +21,7 @@ from splatseg.models._region_graph import (
     merge,
 )
 from splatseg.models._region_masks import SMALLEST, Candidates, candidates
+from splatseg_bench.region_training import dense
 
 Ids = NDArray[np.int32]
 
@@ -53,9 +54,9 @@ def as_rendered(depth: Array, image: NDArray[np.uint8], rng: np.random.Generator
 
 def counts(basins: NDArray[np.int32], ids: Ids) -> Array:
     """(basins, ids): pixels of each basin with each of the ids there are."""
-    values, labels = np.unique(ids, return_inverse=True)
-    codes = basins.astype(np.int64) * len(values) + labels.reshape(ids.shape)
-    size = int(basins.max()) + 1, len(values)
+    labels, count = dense(ids)
+    codes = basins.astype(np.int64) * count + labels
+    size = int(basins.max()) + 1, count
     return (
         np.bincount(codes.reshape(-1), minlength=size[0] * size[1]).reshape(size).astype(np.float32)
     )

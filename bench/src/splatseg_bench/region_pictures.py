@@ -1,7 +1,6 @@
 """Pictures of generated rooms and tables with exact truth, to train the network of regions on."""
 
 import zlib
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -46,21 +45,28 @@ class Picture:
     """(h, w): metres; 0 where there is nothing."""
 
 
-def draw_pictures(folder: Path, *, rooms: int, tables: int, per_scene: int) -> Iterator[Path]:
-    """Render pictures of `varied_room` and `clutter` of seeds from 0 on; those there are stay."""
+def draw_pictures(folder: Path, kind: str, seed: int, count: int) -> list[Path]:
+    """Render pictures of one scene, those that are not there.
+
+    Args:
+        folder: Where they go, made if needed.
+        kind: `table` is of `clutter`, `room` of `varied_room`.
+        seed: Of the scene.
+        count: Pictures of it.
+
+    Returns:
+        The new ones; none of a room that is too full for a camera.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    for kind, count in (("table", tables), ("room", rooms)):
-        for seed in range(count):
-            names = [f"{kind}-{seed:04d}-{k}" for k in range(per_scene)]
-            missing = [k for k, name in enumerate(names) if not (folder / f"{name}.npz").exists()]
-            if not missing:
-                continue
-            try:
-                scene, views = _views(kind, seed, per_scene)
-            except InputError:  # a room too full for a camera
-                continue
-            for k in missing:
-                yield _save(folder / f"{names[k]}.npz", scene, views[k])
+    names = [f"{kind}-{seed:04d}-{k}" for k in range(count)]
+    missing = [k for k, name in enumerate(names) if not (folder / f"{name}.npz").exists()]
+    if not missing:
+        return []
+    try:
+        scene, views = _views(kind, seed, count)
+    except InputError:
+        return []
+    return [_save(folder / f"{names[k]}.npz", scene, views[k]) for k in missing]
 
 
 def _views(kind: str, seed: int, count: int) -> tuple[SyntheticScene, list[Camera]]:

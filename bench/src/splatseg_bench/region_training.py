@@ -1,7 +1,8 @@
 """Training of the network of regions (`splatseg.models._region_network`) on generated pictures."""
 
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
@@ -13,6 +14,8 @@ import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.utils.data import DataLoader, Dataset
+from typing_extensions import override
 
 from splatseg.models._region_network import BOX_SCALE, OUTPUTS, RegionNetwork
 from splatseg_bench.region_pictures import Picture, read_picture
@@ -48,8 +51,8 @@ class Recipe:
     textured: float = 0.5
     """Share of crops whose parts get a random texture each."""
     printed: float = 0.0
-    """Share of parts that show a piece of another picture, as posters, screens and plaids do; the
-    weights that are shipped have met them in merging alone."""
+    """Share of parts that show a piece of another picture, as posters, screens and
+    plaids do; the weights that are shipped have met them in merging alone."""
 
 
 def train(
@@ -58,7 +61,8 @@ def train(
     checkpoint: Path,
     report: Callable[[str], None],
     *,
-    start: Path | None = None,
+    device: str = "cpu",
+    workers: int = 0,
 ) -> None:
     """Train, going on from the checkpoint if there is one: the same as if it had not stopped.
 
@@ -67,39 +71,33 @@ def train(
         recipe: What decides the weights.
         checkpoint: File that is written every 500 steps.
         report: Told the losses.
-        start: Checkpoint whose weights training begins with; None begins with random ones.
+        device: Where the network is trained.
+        workers: Processes that cut crops beside it; 0 cuts them here. Both give the same crops.
     """
     network: Any = RegionNetwork(normalised=True).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     torch.manual_seed(recipe.seed)
     for module in network.modules():
         if isinstance(module, torch.nn.Conv2d):
             module.reset_parameters()
-    if start is not None:
-        network.load_state_dict(torch.load(start, weights_only=True)["network"])
+    network = network.to(device)
     optimiser = torch.optim.AdamW(network.parameters(), weight_decay=recipe.weight_decay)
     step, mean = 0, None
     if checkpoint.exists():
-        state = torch.load(checkpoint, weights_only=True)
+        state = torch.load(checkpoint, weights_only=True, map_location=device)
         if state["recipe"] != _plain(recipe):
             raise ValueError(f"{checkpoint} is of another recipe: {state['recipe']}.")
         network.load_state_dict(state["network"])
         optimiser.load_state_dict(state["optimiser"])
         step = state["step"]
-    held = dict[Path, tuple[Picture, Array | None]]()
-    textures = noises(recipe.seed)
-    while step < recipe.steps:
-        rng = np.random.default_rng([recipe.seed, step])
-        batch = [
-            _crop(
-                _held(held, pictures[rng.integers(len(pictures))]),
-                rng,
-                recipe,
-                textures,
-                _held(held, pictures[rng.integers(len(pictures))])[0] if recipe.printed else None,
-            )
-            for _ in range(recipe.crops)
-        ]
-        losses = _losses(network, batch, recipe)
+    batches: DataLoader[Batch] = DataLoader(
+        Batches(pictures, recipe, step, preloaded=workers > 0),
+        batch_size=None,
+        num_workers=workers,
+        pin_memory=device != "cpu",
+        prefetch_factor=4 if workers else None,
+    )
+    for batch in batches:
+        losses = _losses(network, [part.to(device, non_blocking=True) for part in batch], recipe)
         rate = recipe.rate * min(1, (step + 1) / 200) * (1 - step / recipe.steps) ** 0.9
         for group in optimiser.param_groups:
             group["lr"] = rate
@@ -108,7 +106,7 @@ def train(
         torch.nn.utils.clip_grad_norm_(network.parameters(), 5.0)
         optimiser.step()
         step += 1
-        now = losses.detach().numpy()
+        now = losses.detach()
         mean = now if mean is None else 0.99 * mean + 0.01 * now
         if step % 100 == 0:
             report(f"step {step}: losses {' '.join(f'{v:.4f}' for v in mean.tolist())}")
@@ -119,29 +117,59 @@ def train(
             part.rename(checkpoint)
 
 
+Batch = tuple[Tensor, Tensor, Tensor, Tensor]
+
+
+class Batches(Dataset[Batch]):
+    """What each step from one on is trained with; of the recipe and the step's number alone."""
+
+    def __init__(self, pictures: list[Path], recipe: Recipe, start: int, *, preloaded: bool):
+        self._pictures, self._recipe, self._start = pictures, recipe, start
+        self._held = dict[Path, tuple[Picture, Array | None]]()
+        if preloaded:  # before processes part, which then share them
+            with ThreadPoolExecutor() as pool:
+                self._held = dict(zip(pictures, pool.map(_read, pictures), strict=True))
+
+    def __len__(self) -> int:
+        """Steps that are left."""
+        return self._recipe.steps - self._start
+
+    @override
+    def __getitem__(self, index: int) -> Batch:
+        """Inputs, targets, weights of boxes (as `_crop`'s, one row a crop), whether with HED."""
+        if index >= len(self):
+            raise IndexError(index)
+        rng = np.random.default_rng([self._recipe.seed, self._start + index])
+        rows = [
+            _crop(self._drawn(rng), rng, self._recipe, noises(self._recipe.seed), self._drawn)
+            for _ in range(self._recipe.crops)
+        ]
+        inputs, targets, weights, with_hed = zip(*rows, strict=True)
+        stacked = [torch.from_numpy(np.stack(part)) for part in (inputs, targets, weights)]
+        return stacked[0], stacked[1], stacked[2], torch.tensor(with_hed).float()
+
+    def _drawn(self, rng: np.random.Generator) -> tuple[Picture, Array | None]:
+        path = self._pictures[rng.integers(len(self._pictures))]
+        if path not in self._held:
+            self._held[path] = _read(path)
+        return self._held[path]
+
+
 def _plain(recipe: Recipe) -> dict[str, Any]:
     return asdict(recipe) | {"scales": list(recipe.scales)}
 
 
-def _held(
-    held: dict[Path, tuple[Picture, Array | None]], path: Path
-) -> tuple[Picture, Array | None]:
+def _read(path: Path) -> tuple[Picture, Array | None]:
     """A picture, and HED's contours of it where they were made."""
-    if path not in held:
-        hed = path.with_suffix(".hed.npy")
-        contours = np.load(hed)[..., 0].astype(np.float32) / 255 if hed.exists() else None
-        held[path] = read_picture(path), contours
-    return held[path]
+    hed = path.with_suffix(".hed.npy")
+    contours = np.load(hed)[..., 0].astype(np.float32) / 255 if hed.exists() else None
+    return read_picture(path), contours
 
 
-def _losses(
-    network: RegionNetwork, batch: list[tuple[Array, Array, Array, bool]], recipe: Recipe
-) -> Tensor:
+def _losses(network: RegionNetwork, batch: Sequence[Tensor], recipe: Recipe) -> Tensor:
     """Of contours of things, parts and HED, of things, and of the boxes of things and parts."""
-    pixels = torch.from_numpy(np.stack([one[0] for one in batch]))
-    targets, weights = (torch.from_numpy(np.stack([one[k] for one in batch])) for k in (1, 2))
-    with_hed = torch.tensor([one[3] for one in batch]).float()
-    with torch.autocast("cpu", torch.bfloat16):
+    pixels, targets, weights, with_hed = batch
+    with torch.autocast(pixels.device.type, torch.bfloat16):
         found, coarse = network(pixels.contiguous(memory_format=torch.channels_last))
     if coarse is None:
         raise RuntimeError("the network has no coarse head: it is not to be trained.")
@@ -172,9 +200,9 @@ def _crop(
     rng: np.random.Generator,
     recipe: Recipe,
     textures: Array,
-    other: Picture | None,
+    drawn: Callable[[np.random.Generator], tuple[Picture, Array | None]],
 ) -> tuple[Array, Array, Array, bool]:
-    """A crop and what the network is to say of it.
+    """A crop and what the network is to say of it; `drawn` gives the picture that is printed.
 
     Returns:
         Input (3, s, s), targets (12, s / 2, s / 2), weights of things' and of parts' pixels, and
@@ -214,15 +242,19 @@ def _crop(
             *boxes,
         )
     )
-    print_share = recipe.printed if other is not None else 0.0
-    pixels = photographed(
-        image if other is None else with_prints(image, part, other.image, rng, print_share),
-        part, rng, textures, recipe.textured,
-    )  # fmt: skip
+    if recipe.printed:
+        image = with_prints(image, part, drawn(rng)[0].image, rng, recipe.printed)
+    pixels = photographed(image, part, rng, textures, recipe.textured)
     pixels = np.ascontiguousarray(((pixels - 0.45) / 0.25).transpose(2, 0, 1), np.float32)
     if len(targets) != OUTPUTS:
         raise RuntimeError(f"expected {OUTPUTS} targets, got {len(targets)}.")
     return pixels, targets.astype(np.float32), np.stack(weights), hed is not None
+
+
+def dense(ids: Ids) -> tuple[Ids, int]:
+    """Ids from 0 in the order of the ones given, and their number; np.unique would sort them."""
+    there = np.bincount(ids.reshape(-1)) > 0
+    return (np.cumsum(there, dtype=np.int32) - 1)[ids], int(there.sum())
 
 
 def _rims(ids: Ids) -> Array:
@@ -251,12 +283,11 @@ def _boxes(ids: Ids) -> tuple[Array, Array]:
     """
     from scipy import ndimage
 
-    values, labels = np.unique(ids, return_inverse=True)
-    labels = labels.reshape(ids.shape)
+    labels, count = dense(ids)
     corners = np.array(
         [
             (columns.start, rows.start, columns.stop, rows.stop)
-            for rows, columns in ndimage.find_objects(labels + 1, len(values))
+            for rows, columns in ndimage.find_objects(labels + 1, count)
         ],
         np.float32,
     )
@@ -303,9 +334,8 @@ def with_prints(
     share: float,
 ) -> NDArray[np.uint8]:
     """The picture with pieces of another one printed on some parts, shaded as these are."""
-    values, labels = np.unique(part, return_inverse=True)
-    labels = labels.reshape(part.shape)
-    printed = np.flatnonzero(rng.random(len(values)) < share)
+    labels, count = dense(part)
+    printed = np.flatnonzero(rng.random(count) < share)
     if not len(printed):
         return image
     height, width = part.shape
@@ -333,11 +363,10 @@ def photographed(
     x = image.astype(np.float32) / 255
     height, width = part.shape
     if rng.random() < textured:
-        values, labels = np.unique(part, return_inverse=True)
-        labels = labels.reshape(part.shape)
-        which = rng.integers(len(textures), size=len(values))
-        strength = np.where(rng.random(len(values)) < 0.6, rng.gamma(1.5, 0.06, len(values)), 0)
-        tint = 1 + 0.5 * rng.normal(size=(len(values), 3)) * rng.random((len(values), 1))
+        labels, count = dense(part)
+        which = rng.integers(len(textures), size=count)
+        strength = np.where(rng.random(count) < 0.6, rng.gamma(1.5, 0.06, count), 0)
+        tint = 1 + 0.5 * rng.normal(size=(count, 3)) * rng.random((count, 1))
         # Noises go on where they end.
         dy, dx = rng.integers(textures.shape[1] - _SIDE + 1, size=2)
         rows, columns = np.mgrid[dy : dy + height, dx : dx + width] % textures.shape[1]

@@ -162,7 +162,7 @@ def see(
                 seeds=seeds,
                 tracking=tracking,
                 image_of=images,
-                depth_of=_scene_depth(work) if options.depth_from_scene else None,
+                depth_of=scene_depth(work) if options.depth_from_scene else None,
             ),
             progress=step,
         )
@@ -179,7 +179,8 @@ def see(
     return seen
 
 
-def _scene_depth(work: Work) -> Callable[[View], Float[Tensor, "height width"]]:
+def scene_depth(work: Work) -> Callable[[View], Float[Tensor, "height width"]]:
+    """Depth of views as the scene's Gaussians have it; 0 where little of them is in front."""
     field = work.field()
 
     def depth(view: View) -> Float[Tensor, "height width"]:
