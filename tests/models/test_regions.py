@@ -130,6 +130,19 @@ def test_plain_images_of_any_size(shape, value: int) -> None:
     assert bool(torch.isfinite(masks.scores).all())
 
 
+def test_a_small_photograph_is_seen_enlarged(rng, monkeypatch) -> None:
+    image = torch.from_numpy(rng.integers(90, 110, (30, 40, 3)).astype(np.uint8))
+    thing = torch.zeros(30, 40, dtype=torch.bool)
+    thing[10:19, 14:24] = True
+    image[thing] = torch.tensor([200, 40, 40], dtype=torch.uint8)
+    every = RegionOptions(max_masks=400, min_area=0.0, min_score=0.0)
+    masks = learned_masks(image, every)
+    assert best(masks, thing) > 0.85
+    assert min(mask.area for mask in masks.masks) > 0
+    monkeypatch.setattr("splatseg.models.regions.SMALL_SIDE", 1)
+    assert best(learned_masks(image, every), thing) < best(masks, thing)
+
+
 def test_depth_shows_what_colours_hide() -> None:
     """A box before a wall of its colour: it is seen by its depth alone."""
     grey = torch.full((96, 128, 3), 128, dtype=torch.uint8)

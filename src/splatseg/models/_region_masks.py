@@ -191,6 +191,9 @@ def masks_of_regions(
     taken = taken[fits[taken][:, [PART, THING]].max(1) >= min_score]
     height, width = size
     labels = enlarged(pixels.basins.astype(np.int32), height, width)
+    # Of a photograph that was enlarged some basins have no pixel of it.
+    there = np.bincount(labels.reshape(-1), minlength=len(found.basin_areas)) > 0
+    taken = taken[(found.members(taken) & there).any(1)]
     masks = encoded(labels, found.members(taken))
     best = fits[taken]
     return MaskSet(

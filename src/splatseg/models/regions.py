@@ -20,8 +20,14 @@ from splatseg.models._region_masks import masks_of_regions, with_depth, with_hed
 from splatseg.models._region_network import contours_and_boxes, region_network
 from splatseg.models._regions import WORKING_SIZE, reduced
 
-ALGORITHM = 1
+ALGORITHM = 2
 """Grows when the same settings give other masks, so that cached ones are not taken for new."""
+
+
+SMALL_SIDE, MOST_ENLARGED = 384, 3.0
+"""Photographs whose longest side is less are enlarged to it, so many times at most: the best IoU of
+things on photographs of 96 pixels goes from 0.55 to 0.67, of 160 from 0.61 to 0.71, of 240 from
+0.706 to 0.735 (`office` and `toys` reduced, 5 views each)."""
 
 
 @options
@@ -109,7 +115,7 @@ def learned_masks(
     # Torch has one thread in here, so that masks do not depend on how many there are.
     with one_thread():
         size = WORKING_SIZE if hed is None else max(hed.shape[:2])
-        small = np.asarray(reduced(image, size), np.uint8)
+        small = _working(np.asarray(reduced(image, size), np.uint8), own=hed is None)
         contours, predictions = contours_and_boxes(region_network(), small)
     kind = "own"
     if hed is not None:
@@ -129,6 +135,18 @@ def learned_masks(
     )  # fmt: skip
 
 
+def _working(image: NDArray[np.uint8], *, own: bool) -> NDArray[np.uint8]:
+    """The image, enlarged if it is small; HED's contours have a size of their own."""
+    import cv2
+
+    height, width = image.shape[:2]
+    more = min(SMALL_SIDE / max(height, width), MOST_ENLARGED)
+    if more <= 1 or not own:
+        return image
+    size = (round(width * more), round(height * more))
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_CUBIC), np.uint8)
+
+
 def _resized_depth(
     depth: Float[Tensor, "height width"], size: tuple[int, ...]
 ) -> NDArray[np.float32]:
@@ -139,6 +157,7 @@ def _resized_depth(
     if plane.shape == size:
         return plane
     inverse = np.where(plane > 0, 1 / np.maximum(plane, 1e-6), 0).astype(np.float32)
+    how = cv2.INTER_LINEAR if size[0] > plane.shape[0] else cv2.INTER_AREA
     with one_thread():
-        small = cv2.resize(inverse, size[::-1], interpolation=cv2.INTER_AREA)
+        small = cv2.resize(inverse, size[::-1], interpolation=how)
     return np.where(small > 0, 1 / np.maximum(small, 1e-9), 0).astype(np.float32)
