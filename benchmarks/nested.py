@@ -22,7 +22,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import torch
 from scored import ScoredScene, run_rows
 
 from splatseg.core import InstanceTree, Labels, MaskSet
@@ -55,13 +54,7 @@ class OneLevel:
             raise TypeError("expected masks")
         rows = true_levels(self._truth, name)
         kept = [i for i, row in enumerate(rows) if row["level"] in self._levels]
-        index = torch.tensor(kept, dtype=torch.int64)
-        return replace(
-            masks,
-            masks=tuple(masks.masks[i] for i in kept),
-            scores=masks.scores[index],
-            levels=masks.levels[index],
-        )
+        return masks.subset(kept)
 
     def categories_of(self, name: str) -> Mapping[int, int]:
         return self._source.categories_of(name)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
@@ -155,10 +155,16 @@ class MaskSet(Previewed):
     levels: Int[Tensor, "m"]
     """Granularity, 0 the finest; all 0 where the model has no levels."""
 
+    objectness: Float[Tensor, "m"] | None = None
+    """How far a mask is expected to be a whole object, neither a part of one nor several: twice
+    what its IoU with an object is above a half, in [0, 1]. None where the model does not tell."""
+
     def __post_init__(self) -> None:
         convert_fields(self)
-        check_shape("scores", self.scores, (len(self.masks),))
-        check_finite("scores", self.scores)
+        for name, values in (("scores", self.scores), ("objectness", self.objectness)):
+            if values is not None:
+                check_shape(name, values, (len(self.masks),))
+                check_finite(name, values)
         for i, mask in enumerate(self.masks):
             if (mask.height, mask.width) != (self.height, self.width):
                 raise ShapeError(
@@ -178,6 +184,17 @@ class MaskSet(Previewed):
     def dense(self, index: int) -> Bool[Tensor, "height width"]:
         """One mask as booleans."""
         return self.masks[index].decode()
+
+    def subset(self, rows: Sequence[int]) -> "MaskSet":
+        """Some of the masks, in the order given."""
+        index = torch.tensor(rows, dtype=torch.int64)
+        return replace(
+            self,
+            masks=tuple(self.masks[i] for i in rows),
+            scores=self.scores[index],
+            levels=self.levels[index],
+            objectness=None if self.objectness is None else self.objectness[index],
+        )
 
     @classmethod
     @boundary

@@ -202,6 +202,7 @@ def masks_of_regions(
         masks=tuple(masks),
         scores=torch.from_numpy(best[:, [PART, THING]].max(1).astype(np.float32)),
         levels=torch.zeros(len(masks), dtype=torch.int32),
+        objectness=torch.from_numpy(best[:, GOOD_THING].astype(np.float32)),
     )
 
 

@@ -129,15 +129,7 @@ class EvidenceWriter(ABC):
 def without_empty(masks: MaskSet) -> MaskSet:
     """The masks that have a pixel."""
     keep = [i for i, mask in enumerate(masks.masks) if mask.area]
-    if len(keep) == len(masks):
-        return masks
-    return MaskSet(
-        height=masks.height,
-        width=masks.width,
-        masks=tuple(masks.masks[i] for i in keep),
-        scores=masks.scores[keep],
-        levels=masks.levels[keep],
-    )
+    return masks if len(keep) == len(masks) else masks.subset(keep)
 
 
 def some(names: Sequence[str]) -> str:

@@ -6,7 +6,7 @@ of the views that the model was opened with.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -146,13 +146,8 @@ def best_masks(masks: MaskSet, prompt: Prompt, *, count: int = 3) -> MaskSet:
         (i for i in range(len(masks)) if fits[i] >= MIN_FIT),
         key=lambda i: (-fits[i], -recorded[i], masks.masks[i].area, i),
     )[:count]
-    return MaskSet(
-        height=masks.height,
-        width=masks.width,
-        masks=tuple(masks.masks[i] for i in order),
-        scores=torch.tensor([fits[i] * recorded[i] for i in order], dtype=torch.float32),
-        levels=masks.levels[order],
-    )
+    scores = torch.tensor([fits[i] * recorded[i] for i in order], dtype=torch.float32)
+    return replace(masks.subset(order), scores=scores)
 
 
 def _fit(masks: MaskSet, index: int, prompt: Prompt) -> float:

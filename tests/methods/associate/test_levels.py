@@ -1,5 +1,7 @@
 """Levels of trees spelt out: what has parts is an object, what has objects a group."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy.sparse
@@ -28,6 +30,42 @@ def nested_share(nested: Nesting) -> float:
 
 def levels(*arguments) -> list[int]:
     return node_levels(tree(*arguments)).tolist()
+
+
+@pytest.mark.parametrize(
+    ("objectness", "support", "expected"),
+    [
+        # A shelf with two books of one piece each: the shape alone takes them for parts of it.
+        ([0.5, 0.6, 0.7], None, [GROUP, OBJECT, OBJECT]),
+        ([0.9, 0.3, 0.3], None, [OBJECT, PART, PART]),
+        # 0.5^1.5 = 0.354 against 2 x 0.3^1.5 = 0.329, 2 x 0.32^1.5 = 0.362.
+        ([0.5, 0.3, 0.3], None, [OBJECT, PART, PART]),
+        ([0.5, 0.32, 0.32], None, [GROUP, OBJECT, OBJECT]),
+        ([0.5, 0.32, 0.32], [1, 0.9, 0.9], [OBJECT, PART, PART]),
+        ([0.0, 0.0, 0.0], None, [OBJECT, PART, PART]),
+        ([0.5, 0.6, np.nan], None, [OBJECT, PART, PART]),
+    ],
+)
+def test_masks_that_tell_objects_decide_what_shapes_cannot(objectness, support, expected) -> None:
+    nodes = tree([-1, 0, 0], support)
+    assert node_levels(nodes, np.array(objectness)).tolist() == expected
+
+
+def test_objectness_is_the_mean_of_a_nodes_masks() -> None:
+    nodes = replace(tree([-1, 0, 0]), node=np.array([0, 1, 1, 2, 2, -1]))
+    # Means 0.5, 0.3, 0.3; the mask of no node counts nowhere.
+    objectness = np.array([0.5, 0.0, 0.6, 0.2, 0.4, 1.0])
+    assert node_levels(nodes, objectness).tolist() == [OBJECT, PART, PART]
+    objectness[1] = 0.2
+    assert node_levels(nodes, objectness).tolist() == [GROUP, OBJECT, OBJECT]
+
+
+def test_what_is_above_objects_are_groups_and_below_them_parts() -> None:
+    nodes = tree([-1, 0, 0, 1, 1, 3])
+    found = node_levels(nodes, np.array([0.6, 0.7, 0.7, 0.2, 0.2, 0.2]))
+    assert found.tolist() == [GROUP, OBJECT, OBJECT, PART, PART, PART]
+    deep = node_levels(nodes, np.array([0.1, 0.1, 0.1, 0.1, 0.1, 0.9]))
+    assert deep.tolist() == [GROUP, GROUP, OBJECT, GROUP, OBJECT, OBJECT]
 
 
 @pytest.mark.parametrize(

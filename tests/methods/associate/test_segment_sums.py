@@ -32,6 +32,7 @@ def table(rng) -> SegmentTable:
         category=np.full(SEGMENTS, -1),
         score=np.ones(SEGMENTS),
         level=np.zeros(SEGMENTS, np.int64),
+        objectness=np.full(SEGMENTS, np.nan),
         covered=np.ones(GAUSSIANS, np.float32),
     )
 

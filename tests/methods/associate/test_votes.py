@@ -37,6 +37,7 @@ def table_of(masses: np.ndarray) -> SegmentTable:
         category=np.full(count, -1),
         score=np.ones(count),
         level=np.zeros(count, np.int64),
+        objectness=np.full(count, np.nan),
         covered=np.ones(len(masses), np.float32),
     )
 

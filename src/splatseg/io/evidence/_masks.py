@@ -6,7 +6,7 @@ The JSON and the folder are what SAM's automatic mask generator writes.
 import csv
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -64,6 +64,7 @@ class _Row:
     score: float | None = None
     predicted_iou: float | None = None
     level: Annotated[int, Meta(ge=-(2**31), le=2**31 - 1)] = 0
+    objectness: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -243,12 +244,21 @@ def _read_json(path: Path) -> MaskSet:
         for i, row in enumerate(rows)
     ]
     scores = [next((s for s in (r.score, r.predicted_iou) if s is not None), 1.0) for r in rows]
-    return _mask_set(masks, scores, [row.level for row in rows], (height, width))
+    objectness = [row.objectness for row in rows if row.objectness is not None]
+    expect(
+        len(objectness) in (0, len(rows)), path,
+        f"objectness of all {len(rows)} masks or of none, got {len(objectness)}",
+    )  # fmt: skip
+    found = _mask_set(masks, scores, [row.level for row in rows], (height, width))
+    known = torch.tensor(objectness, dtype=torch.float32).clamp(0, 1)
+    return replace(found, objectness=known) if objectness else found
 
 
 def masks_content(masks: MaskSet) -> dict[str, Any]:
     """The JSON object of a set of masks, which is read back as the same."""
-    scored = zip(masks.masks, masks.scores.tolist(), masks.levels.tolist(), strict=True)
+    count = len(masks)
+    known = [None] * count if masks.objectness is None else masks.objectness.tolist()
+    rows_of = zip(masks.masks, masks.scores.tolist(), masks.levels.tolist(), known, strict=True)
     rows = [
         {
             "segmentation": {"size": [masks.height, masks.width], "counts": mask.to_coco()},
@@ -257,6 +267,7 @@ def masks_content(masks: MaskSet) -> dict[str, Any]:
             "score": score,
             "level": level,
         }
-        for mask, score, level in scored
+        | ({} if objectness is None else {"objectness": objectness})
+        for mask, score, level, objectness in rows_of
     ]
     return {"height": masks.height, "width": masks.width, "masks": rows}

@@ -223,6 +223,7 @@ def _associated_tree(
     found, level = separated_levels(
         segment_tree(table, agreement, nested, group, min_support=support, min_views=count),
         nested,
+        table.objectness,
         min_support=support,
         min_views=count,
     )

@@ -235,6 +235,9 @@ class SegmentTable:
     level: NDArray[np.int64]
     """(segments,): granularity that the model gave, 0 the finest; all 0 where it gives none."""
 
+    objectness: NDArray[np.float64]
+    """(segments,): `MaskSet.objectness`; NaN where the model gave none."""
+
     covered: NDArray[np.float32]
     """(Gaussians,): share of what all views see of each Gaussian that lies in some segment; 1
     where pixels in no segment tell nothing, and for what no view sees."""
@@ -406,7 +409,7 @@ def segment_table(
             raise InputError(f"evidence: there are no segments of view {view.name!r}.")
     ordered = sorted(views, key=lambda view: view.name)
     entries = SegmentEntries(len(gaussians), MAX_VIEWS)
-    rows: list[tuple[int, int, int, float, int]] = []
+    rows: list[tuple[int, int, int, float, int, float]] = []
     covered, visible = np.zeros((2, len(gaussians)))
     for place, view in enumerate(ordered):
         segments = source.segments_of(view.name)
@@ -421,7 +424,7 @@ def segment_table(
         camera = camera_of_map(view, segments.height, segments.width)
         found = view_masses(gaussians, camera, segments, backend=backend)
         rows += [
-            (place, name, categories.get(name, UNLABELLED), score, _level_of(segments, name))
+            (place, name, categories.get(name, UNLABELLED), score, *_kind_of(segments, name))
             for name, score in zip(names, scores, strict=True)
         ]
         outside = isinstance(segments, MaskSet)
@@ -432,7 +435,7 @@ def segment_table(
             progress(place + 1, len(ordered))
     if not rows:
         raise InputError(f"evidence: expected a segment in {len(views)} views, found none.")
-    view_of, name_of, category, score, level = (
+    view_of, name_of, category, score, level, objectness = (
         np.array(column) for column in zip(*rows, strict=True)
     )
     gaussian, segment, mass, seen = entries.result()
@@ -451,6 +454,7 @@ def segment_table(
         category=category.astype(np.int64),
         score=score.astype(np.float64),
         level=level.astype(np.int64),
+        objectness=objectness.astype(np.float64),
         covered=_shares_of(covered, visible),
     )
 
@@ -512,9 +516,12 @@ def _in_order(segments: LabelMap | MaskSet) -> tuple[list[int], list[float]]:
     return [name for _, name in pairs], [float(sure[at]) for at, _ in pairs]
 
 
-def _level_of(segments: LabelMap | MaskSet, name: int) -> int:
-    """The granularity of a mask; segments of label maps have none."""
-    return int(segments.levels[name]) if isinstance(segments, MaskSet) else 0
+def _kind_of(segments: LabelMap | MaskSet, name: int) -> tuple[int, float]:
+    """The granularity and the objectness of a mask; segments of label maps have none."""
+    if not isinstance(segments, MaskSet):
+        return 0, np.nan
+    known = segments.objectness
+    return int(segments.levels[name]), np.nan if known is None else float(known[name])
 
 
 def _first_pixel(segments: MaskSet, index: int) -> int:

@@ -412,10 +412,4 @@ class GroundedMatches:
         sure.sort(key=lambda i: (-float(found.scores[i]), i))
         if self._options.objects == "one":
             sure = sure[:1]
-        return MaskSet(
-            height=view.camera.height,
-            width=view.camera.width,
-            masks=tuple(found.masks[i] for i in sure),
-            scores=found.scores[sure],
-            levels=found.levels[sure],
-        )
+        return found.subset(sure)
