@@ -95,6 +95,11 @@ def test_masks_are_things_and_the_same_again(squares) -> None:
     assert float(masks.scores.min()) > 0
     assert float(masks.scores.max()) <= 1
     assert not masks.levels.any()
+    dense = [masks.dense(i) for i in range(len(masks))]
+    ious = torch.tensor([float((one & red).sum() / (one | red).sum()) for one in dense])
+    assert masks.objectness is not None
+    assert float(masks.objectness[ious.argmax()]) > 0.5
+    assert 0 <= float(masks.objectness.min()) <= float(masks.objectness.max()) <= 1
     before = torch.get_num_threads()
     try:
         for count in (1, 2):

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from splatseg.core import ClassInfo, ClassTable, DeepFeatures, FeatureMap, LabelMap, MaskSet
-from splatseg.errors import FileFormatError, InputError, MissingFileError, RangeError
+from splatseg.errors import FileFormatError, InputError, MissingFileError, RangeError, ShapeError
 from splatseg.io.captures import read_capture
 from splatseg.io.evidence import (
     FeatureEvidence,
@@ -349,13 +349,35 @@ def test_masks_round_trip(tmp_path_factory, seed, count, height, width) -> None:
     scores = generator.random(count).astype(np.float32).tolist()
     levels = generator.integers(0, 3, count).tolist()
     folder = create_evidence(tmp_path_factory.mktemp("m") / "e", kind="masks")
-    save_masks(MaskSet.from_dense(dense, scores=scores, levels=levels), folder, "a")
+    masks = MaskSet.from_dense(dense, scores=scores, levels=levels)
+    objectness = torch.from_numpy(generator.random(count).astype(np.float32))
+    save_masks(masks, folder, "a")
+    save_masks(replace(masks, objectness=objectness), folder, "b")
+    known = open_evidence(folder).masks("b").objectness
+    assert torch.equal(known, objectness) if count else known is None
     read = open_evidence(folder).masks("a")
+    assert read.objectness is None
     assert (read.height, read.width, len(read)) == (height, width, count)
     assert read.scores.tolist() == scores
     assert read.levels.tolist() == levels
     for i in range(count):
         assert torch.equal(read.dense(i), dense[i])
+
+
+def test_a_subset_of_masks_has_what_its_masks_have(rng) -> None:
+    dense = torch.from_numpy(rng.random((3, 4, 5)) < 0.5)
+    masks = MaskSet.from_dense(dense, scores=[0.1, 0.2, 0.3], levels=[2, 1, 0])
+    masks = replace(masks, objectness=torch.tensor([0.5, 0.25, 0.75]))
+    some = masks.subset([2, 0])
+    assert torch.equal(some.dense(0), dense[2])
+    assert torch.equal(some.dense(1), dense[0])
+    assert some.scores.tolist() == pytest.approx([0.3, 0.1])
+    assert some.levels.tolist() == [0, 2]
+    assert some.objectness is not None
+    assert some.objectness.tolist() == [0.75, 0.5]
+    assert replace(masks, objectness=None).subset([1]).objectness is None
+    with pytest.raises(ShapeError, match="objectness"):
+        replace(masks, objectness=torch.ones(2))
 
 
 MASKS = {"height": 2, "width": 2, "masks": [{"segmentation": {"size": [2, 2], "counts": [1, 3]}}]}
@@ -387,6 +409,10 @@ def test_uncompressed_runs_and_defaults(tmp_path) -> None:
         (
             lambda m: m["masks"][0].update(level=2**31),
             "level: .* whole number .*, got 2147483648",
+        ),
+        (
+            lambda m: m["masks"].append(m["masks"][0] | {"objectness": 0.5}),
+            "objectness of all 2 masks or of none, got 1",
         ),
     ],
 )
