@@ -603,7 +603,7 @@ def test_what_is_at_hand_makes_masks(things, monkeypatch) -> None:
 
     monkeypatch.setattr(models, "find_model", find)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    assert _job_process._model_at_hand() == "classical"
+    assert _job_process._model_at_hand() == "regions"
     assert asked == []
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     assert _job_process._model_at_hand() == "the model"
@@ -628,12 +628,12 @@ def test_masks_at_hand_cover_all_views_those_of_sam_first(things) -> None:
 
 
 def test_masks_that_were_stopped_are_gone_on_with(things, monkeypatch) -> None:
-    from splatseg.models.classical import Classical
+    from splatseg.models.regions import Regions
 
     views = load_scene(things)
     second = replace(views.views[0], name="second")
     save_scene(replace(views, views=(*views.views, second)), things)
-    masks, seen = Classical.masks, []
+    masks, seen = Regions.masks, []
 
     def stopped(self, image):
         seen.append(image)
@@ -642,12 +642,12 @@ def test_masks_that_were_stopped_are_gone_on_with(things, monkeypatch) -> None:
         return masks(self, image)
 
     with monkeypatch.context() as patch:
-        patch.setattr(Classical, "masks", stopped)
+        patch.setattr(Regions, "masks", stopped)
         with pytest.raises(KeyboardInterrupt):
             main(["see", str(things), "cpu"], io.StringIO("{}"), io.StringIO())
     out = io.StringIO()
     assert main(["see", str(things), "cpu"], io.StringIO("{}"), out) == 0
-    assert "masks of 2 views by classical" in out.getvalue()
+    assert "masks of 2 views by regions" in out.getvalue()
 
 
 def test_a_job_ends_with_the_server(serving, things, monkeypatch) -> None:

@@ -87,7 +87,7 @@ def _model_at_hand() -> "Model | str":
         for name in _WITH_WEIGHTS:
             with contextlib.suppress(MissingFileError, MissingPackageError):
                 return find_model(name)
-    return "classical"
+    return "regions"
 
 
 def _see(root: Path, given: dict[str, Any], backend: BackendName, observer: Observer) -> str:

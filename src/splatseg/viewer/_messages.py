@@ -394,7 +394,7 @@ class See(_Incoming, kw_only=True):
     """Masks of the views."""
 
     model: Annotated[str, Meta(pattern=r"\A[a-z0-9][a-z0-9-]{0,39}\Z")] | None = None
-    """None takes what is at hand: masks that are there, weights on this machine, or ``classical``,
+    """None takes what is at hand: masks that are there, weights on this machine, or ``regions``,
     which needs none."""
 
 
