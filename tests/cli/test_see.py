@@ -9,7 +9,6 @@ import pytest
 import torch
 from PIL import Image
 
-from splatseg import tasks
 from splatseg.core import FeatureMap, LabelMap, MaskSet, Panoptic, Segment
 from splatseg.errors import InputError
 from splatseg.io.evidence import (
@@ -21,7 +20,7 @@ from splatseg.io.evidence import (
     save_masks,
 )
 from splatseg.io.scene import load_scene
-from splatseg.models import EvidenceRequest, record_evidence
+from splatseg.models import EvidenceRequest, find_model, record_evidence
 from support.shared import generated_and
 
 WIDTH, HEIGHT = 28, 20
@@ -63,7 +62,7 @@ def refused(result: tuple[int, str, str]) -> str:
 
 def test_regions_see_with_the_scene_s_depth_or_without(small, splatseg) -> None:
     see = ("see", small.scene, "--model", "regions", "--evidence")
-    for name, flags in (("plain", ()), ("deep", ("--depth-from-scene",))):
+    for name, flags in (("plain", ("--no-depth-from-scene",)), ("deep", ())):
         status, out, err = splatseg(*see, name, *flags)
         assert status == 0, err
         assert out.startswith("masks of 3 views by regions, ")
@@ -72,14 +71,16 @@ def test_regions_see_with_the_scene_s_depth_or_without(small, splatseg) -> None:
                 for name in ("plain", "deep")]  # fmt: skip
     assert "depth_from_scene" not in settings[0]
     assert settings[1]["depth_from_scene"] is True
-    assert "depth_from_scene" in refused(splatseg(*see, "deep"))
-    status, _, err = splatseg("see", small.scene, *CLASSICAL, "--depth-from-scene")
+    sentence = refused(splatseg(*see, "deep", "--no-depth-from-scene"))
+    assert "depth_from_scene" in sentence
+    status, _, err = splatseg("see", small.scene, *CLASSICAL, "--no-depth-from-scene")
     assert status == 2
-    assert "Unrecognized options: --depth-from-scene" in err
-    options = tasks.SeeOptions(depth_from_scene=True)
+    assert "Unrecognized options: --no-depth-from-scene" in err
+    scene, folder = load_scene(small.scene), small.scene / "evidence" / "m"
+    request = EvidenceRequest(depth_of=lambda view: torch.ones(HEIGHT, WIDTH))
     with pytest.raises(InputError, match="depth_from_scene: expected a model that takes depth"):
-        tasks.see(load_scene(small.scene), "classical", "m", options=options)
-    assert not (small.scene / "evidence" / "m").exists()
+        record_evidence(find_model("classical"), scene.train_views, folder, request)
+    assert not folder.exists()
 
 
 # The classical stand-in

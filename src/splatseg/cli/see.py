@@ -81,7 +81,7 @@ _TRACKING: tuple[Any, ...] = (
         field(default_factory=TrackingOptions),
     ),
 )
-_DEPTH: tuple[Any, ...] = (("depth_from_scene", Annotated[bool, tyro.conf.Suppress], False),)
+_DEPTH: tuple[Any, ...] = (("depth_from_scene", Annotated[bool, tyro.conf.Suppress], True),)
 
 
 def _seeing(*, tracks: bool, takes_depth: bool) -> Any:

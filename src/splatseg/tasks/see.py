@@ -11,7 +11,7 @@ from torch import Tensor
 
 from splatseg.core import Model, PromptableMasks, Renderable, Scene, View
 from splatseg.core.boundary import boundary
-from splatseg.core.models import Image
+from splatseg.core.models import DepthAwareMasks, Image
 from splatseg.core.options import options
 from splatseg.core.typed_text import typed_field
 from splatseg.errors import InputError
@@ -90,9 +90,9 @@ class SeeOptions:
     tracking: TrackingOptions = field(default_factory=TrackingOptions)
     """Which seeds count, and the order of the views."""
 
-    depth_from_scene: bool = False
-    """Tell a model of masks the depth of the scene's Gaussians too, whose steps and folds are
-    borders that colours hide; models regions and hed."""
+    depth_from_scene: bool = True
+    """Tell models of masks that take it (regions and hed) the depth of the scene's Gaussians too,
+    whose steps and folds are borders that colours hide."""
 
     overwrite: bool = False
     """Replace what an earlier run wrote under the same name."""
@@ -149,6 +149,8 @@ def see(
         observer.note(f"{found.name}: {found.note}")
     folder = scene_path(root, EVIDENCE_FOLDER, evidence)
     images = ViewImages(work)
+    takes_depth = options.depth_from_scene and isinstance(found, DepthAwareMasks)
+    depth_of = scene_depth(work) if takes_depth else None
     with work_on_scene(root, "see"), observer.stage("see") as step:
         seen = record_evidence(
             found,
@@ -162,7 +164,7 @@ def see(
                 seeds=seeds,
                 tracking=tracking,
                 image_of=images,
-                depth_of=scene_depth(work) if options.depth_from_scene else None,
+                depth_of=depth_of,
             ),
             progress=step,
         )

@@ -146,7 +146,7 @@ def test_masks_are_made_and_answer_clicks(new_tab, serve, browser_scene, tmp_pat
     path, folder = tmp_path / "things.ply", tmp_path / "things"
     write_splats(load_scene(browser_scene).gaussians, path)
     # Few small views: the page would wait a minute for those of `splatseg view FILE`.
-    import_scene(path, folder, options=ImportOptions(up="+z", max_views=12, width=96))
+    import_scene(path, folder, options=ImportOptions(up="+z", max_views=20, width=144))
     tab = new_tab(serve(folder))
     tab.open()
     tab.until(lambda: thumbnail(tab) > 0, "a camera is drawn")
