@@ -62,7 +62,7 @@ def rendered_depths(scene: Path, names: list[str]) -> dict[str, tuple[torch.Tens
     """The depth of training views of a fitted scene, and their focal lengths."""
     work = Work(scene=load_scene(scene))
     depth = scene_depth(work)
-    views = {view.name: view for view in work.views("train") if view.name in names}
+    views = {view.name: view for view in work.scene.train_views if view.name in names}
     return {name: (depth(view), view.camera.fx) for name, view in views.items()}
 
 

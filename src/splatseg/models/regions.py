@@ -40,7 +40,7 @@ class RegionOptions:
     min_area: Share = 0.0005
     """Masks smaller than this share of the image are dropped."""
 
-    min_score: Share = 0.3
+    min_score: Share = 0.4
     """Masks whose expected IoU with a true thing or part is less are dropped."""
 
 
