@@ -633,16 +633,16 @@ def test_masks_that_were_stopped_are_gone_on_with(things, monkeypatch) -> None:
     views = load_scene(things)
     second = replace(views.views[0], name="second")
     save_scene(replace(views, views=(*views.views, second)), things)
-    masks, seen = Regions.masks, []
+    masks, seen = Regions.masks_with_depth, []
 
-    def stopped(self, image):
+    def stopped(self, image, *depth):
         seen.append(image)
         if len(seen) == 2:
             raise KeyboardInterrupt
-        return masks(self, image)
+        return masks(self, image, *depth)
 
     with monkeypatch.context() as patch:
-        patch.setattr(Regions, "masks", stopped)
+        patch.setattr(Regions, "masks_with_depth", stopped)
         with pytest.raises(KeyboardInterrupt):
             main(["see", str(things), "cpu"], io.StringIO("{}"), io.StringIO())
     out = io.StringIO()
