@@ -125,6 +125,8 @@ def masks_json(folder: Path) -> Target:
         {"segmentation": {"size": size, "counts": rle.to_coco()}, "score": 0.5, "level": 1},
         {"segmentation": {"size": size, "counts": rle.counts.tolist()}, "predicted_iou": 1},
     ]
+    for row in rows:
+        row["objectness"] = 0.5
     content = {"height": HEIGHT, "width": WIDTH, "masks": rows}
     (folder / "a.json").write_text(json.dumps(content))
     return _evidence(folder, folder / "a.json", "masks")
