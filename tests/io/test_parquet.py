@@ -1,11 +1,15 @@
 """Rows of Parquet: in any order, of any groups, and never more than is allowed."""
 
+from contextlib import nullcontext
+from types import SimpleNamespace
+
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
 from splatseg.errors import FileFormatError, MissingFileError
+from splatseg.io import parquet as module
 from splatseg.io.limits import unpacking
 from splatseg.io.parquet import (
     RowReader,
@@ -79,6 +83,17 @@ def test_a_small_file_of_many_values(tmp_path) -> None:
     with unpacking(1 << 20), pytest.raises(FileFormatError, match="one row, which is 4"):
         RowReader(file, ("lists",)).row(0)
     assert len(RowReader(file, ("lists",)).row(1)["lists"]) == 1 << 20
+
+
+@pytest.mark.parametrize("rows", [-3, 1 << 62])
+def test_a_footer_with_a_row_count_that_none_can_have(file, monkeypatch, rows) -> None:
+    """A damaged bit makes it (fuzz of waymo-lidar_segmentation.parquet, seed 48, case 1940)."""
+    group = SimpleNamespace(num_rows=rows, total_byte_size=10)
+    metadata = SimpleNamespace(num_row_groups=1, row_group=lambda index: group)
+    damaged = SimpleNamespace(schema_arrow=pa.schema([("lists", pa.int8())]), metadata=metadata)
+    monkeypatch.setattr(module, "_opened", lambda path: nullcontext(damaged))
+    with pytest.raises(FileFormatError, match="expected groups of 0 rows or more, got"):
+        RowReader(file, ("lists",))
 
 
 @pytest.mark.parametrize("cut", [1, 5, 9, 40, 200])

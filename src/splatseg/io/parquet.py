@@ -45,7 +45,10 @@ class RowReader:
         with _opened(path) as file:
             known = [str(name) for name in file.schema_arrow.names]
             groups = [file.metadata.row_group(i) for i in range(file.metadata.num_row_groups)]
-            self._ends = np.cumsum([int(group.num_rows) for group in groups], dtype=np.int64)
+            counts = [int(group.num_rows) for group in groups]
+            sound = min(counts, default=0) >= 0 and sum(counts) < 1 << 62
+            expect(sound, path, "groups of 0 rows or more", str(counts[:3]))
+            self._ends = np.cumsum(counts, dtype=np.int64)
             self._sizes = [int(group.total_byte_size) for group in groups]
         for name in columns:
             expect(name in known, path, f"the column {name}", ", ".join(known))
