@@ -161,6 +161,16 @@ class AutomaticMasks(Model, Protocol):
 
 
 @runtime_checkable
+class ConcurrentMasks(AutomaticMasks, Protocol):
+    """Finds the masks of an image in one thread, so those of several images at once."""
+
+    @property
+    def concurrent(self) -> bool:
+        """Whether several threads may ask at once."""
+        ...
+
+
+@runtime_checkable
 class DepthAwareMasks(AutomaticMasks, Protocol):
     """Finds the things in an image better where the depth of what it shows is known."""
 

@@ -8,10 +8,15 @@ others, which are torch alone, run in `network_inference`.
 """
 
 import threading
-from collections.abc import Generator
+from collections.abc import Callable, Generator, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from typing import TypeVar
 
 import torch
+
+T = TypeVar("T")
+R = TypeVar("R")
 
 
 class _Limit(threading.local):
@@ -68,3 +73,21 @@ def network_inference() -> Generator[None]:
     """Run a network of others: without gradients, on all threads of torch; also a decorator."""
     with all_torch_threads(), torch.inference_mode():
         yield
+
+
+def in_threads(function: Callable[[T], R], items: Iterable[T], threads: int) -> Generator[R]:
+    """Call a function for each item, several at once, torch with one thread in each.
+
+    Whatever is stopped or raised, no call is begun after it.
+
+    Yields:
+        The results, in the order of the items.
+    """
+    if threads == 1:
+        yield from map(function, items)
+        return
+    pool = ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,))
+    try:
+        yield from pool.map(function, items)
+    finally:
+        pool.shutdown(cancel_futures=True)

@@ -13,6 +13,7 @@ depends on the image alone.
 """
 
 import heapq
+import threading
 from collections.abc import Generator, Iterable, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -47,17 +48,39 @@ class PixelFeatures:
     """(h, w): boundary strength, 0 in flat parts, about 1 at strong edges."""
 
 
+class _Blocks:
+    """Blocks of `one_thread` that run now."""
+
+    def __init__(self) -> None:
+        self.lock = threading.Lock()
+        self.count = 0
+        self.before = 0
+        """cv2's threads before the first of them."""
+
+
+_blocks = _Blocks()
+
+
 @contextmanager
 def one_thread() -> Generator[None]:
-    """Have cv2 work in one thread: the same sums in the same order, whatever the machine."""
+    """Have cv2 work in one thread: the same sums in the same order, whatever the machine.
+
+    cv2 has one number for all of a program's threads, so the last block to end gives it back.
+    """
     import cv2
 
-    before = cv2.getNumThreads()
-    cv2.setNumThreads(1)
+    with _blocks.lock:
+        _blocks.count += 1
+        if _blocks.count == 1:
+            _blocks.before = cv2.getNumThreads()
+            cv2.setNumThreads(1)
     try:
         yield
     finally:
-        cv2.setNumThreads(before)
+        with _blocks.lock:
+            _blocks.count -= 1
+            if not _blocks.count:
+                cv2.setNumThreads(_blocks.before)
 
 
 def pixel_features(image: NDArray[np.uint8], *, strength: Array | None = None) -> PixelFeatures:

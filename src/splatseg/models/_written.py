@@ -3,6 +3,7 @@
 import shutil
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar
@@ -12,11 +13,13 @@ from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
+from splatseg import _native
 from splatseg._check import check_choice
 from splatseg.core import UNLABELLED, ClassTable, DepthMap, LabelMap, MaskSet, View, camera_of_map
 from splatseg.core.models import (
     AutomaticMasks,
     BatchedModel,
+    ConcurrentMasks,
     DeepFeatures,
     DenseDepth,
     DenseFeatures,
@@ -29,6 +32,7 @@ from splatseg.core.models import (
     TextFeatures,
     TextFeaturesWithWords,
 )
+from splatseg.core.threads import in_threads
 from splatseg.errors import InputError, ShapeError
 from splatseg.io.annotations import AREA_KINDS, AnnotationEvidence
 from splatseg.io.atomic import atomic_file, path_inside
@@ -66,6 +70,10 @@ _QUESTIONS: dict[str, tuple[type[Any], EvidenceKind, str]] = {
     "tracked": (MaskTracker, "tracked", "track"),
 }
 """The protocol of a question and the kind of evidence that it makes, the most telling first."""
+
+_VIEWS_A_THREAD = 2
+"""Of views whose masks are found in several threads: some wait less for others, and little is lost
+when the work is stopped."""
 
 _SEGMENT_PARTS = ".segments"
 """Folder of the segments of single views while panoptic evidence is being written."""
@@ -185,6 +193,8 @@ def ability(model: Model, what: str | None) -> str:
 
 def batch_of(model: Model) -> int:
     """How many views are looked at together."""
+    if isinstance(model, ConcurrentMasks) and model.concurrent:
+        return _VIEWS_A_THREAD * _native.threads()
     return max(1, model.batch_size) if isinstance(model, BatchedModel) else 1
 
 
@@ -193,13 +203,17 @@ def announce(
 ) -> None:
     """Let a model that takes several images at once see those of the next views.
 
-    Images of one size go together.
+    Images of one size go together. Masks that take one thread an image are found in several.
 
     Args:
         model: The model.
         targets: What is asked of it, and the folder that each is written to.
         views: The next views.
     """
+    if isinstance(model, ConcurrentMasks) and model.concurrent:
+        for writer, folder in targets:
+            if isinstance(writer, ComputedEvidence) and writer.what == "masks":
+                writer.find_masks(folder, views)
     if not isinstance(model, BatchedModel) or len(views) < 2:
         return
     images: list[Image] = []
@@ -237,6 +251,8 @@ class ComputedEvidence(EvidenceWriter):
             self.settings = {"depth_from_scene": True}
         self._counts: dict[str, int] = {}
         """Masks by view, for the notes."""
+        self._found: dict[str, Any] = {}
+        """Masks of views that are not written yet."""
 
     @override
     def start(self, folder: Path, views: Sequence[View]) -> None:
@@ -245,13 +261,24 @@ class ComputedEvidence(EvidenceWriter):
         if knows_words and self._model.words:
             save_text_embeddings(word_vectors(self._model), folder)
 
+    def find_masks(self, folder: Path, views: Sequence[View]) -> None:
+        """Find the masks of several views at once; `write` takes them."""
+        calls = [self._call(folder, view) for view in views]
+        found = in_threads(lambda call: call(), calls, min(_native.threads(), len(calls)))
+        self._found = dict(zip((view.name for view in views), found, strict=True))
+
+    def _call(self, folder: Path, view: View) -> Callable[[], Any]:
+        """What asks the model, once the picture and depth of a view are there."""
+        image = self.pictures.of(view, folder)
+        if self._depth_of is None:
+            return partial(getattr(self._model, _QUESTIONS[self.what][2]), image)
+        return partial(self._model.masks_with_depth, image, self._depth_of(view), view.camera.fx)
+
     @override
     def write(self, folder: Path, view: View) -> int:
-        image = self.pictures.of(view, folder)
-        if self._depth_of is not None:
-            found = self._model.masks_with_depth(image, self._depth_of(view), view.camera.fx)
-        else:
-            found = getattr(self._model, _QUESTIONS[self.what][2])(image)
+        found = self._found.pop(view.name, None)
+        if found is None:
+            found = self._call(folder, view)()
         maps: Sequence[Any] = (found,)
         if isinstance(found, DeepFeatures | Panoptic):
             maps = found.maps if isinstance(found, DeepFeatures) else (found.ids,)

@@ -78,6 +78,11 @@ class Classical:
         """That it is a stand-in."""
         return "a stand-in without weights: it goes by colour and edges, not by what things are"
 
+    @property
+    def concurrent(self) -> bool:
+        """An image takes one thread."""
+        return True
+
     def masks(self, image: Image) -> MaskSet:
         """Nested masks of several granularities: `region_masks`."""
         return region_masks(image, self.regions)

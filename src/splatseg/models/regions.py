@@ -70,6 +70,11 @@ class Regions:
         """What it was trained on."""
         return "small networks trained on generated rooms and tables, on no photograph"
 
+    @property
+    def concurrent(self) -> bool:
+        """An image takes one thread."""
+        return True
+
     def masks(self, image: Image) -> MaskSet:
         """Masks of things and parts: `learned_masks`."""
         return learned_masks(image, self.regions)

@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
+from splatseg import _native
 from splatseg.core import Camera, PointCloud, View
 from splatseg.core.boundary import boundary
 from splatseg.core.evidence import UNLABELLED
-from splatseg.core.threads import one_torch_thread
+from splatseg.core.threads import in_threads
 from splatseg.errors import InputError
 from splatseg.io.atomic import atomic_folder
 from splatseg.synthetic.photographs import cameras, machine_labels, start_points
@@ -74,11 +75,11 @@ def write_capture(
         if _intrinsics(view.camera) != intrinsics:
             raise InputError(f"views: expected the same intrinsics, {view.name} has others.")
     truths: dict[str, Truth] = {}
-    with one_torch_thread():
-        for i, view in enumerate(chosen):
-            truths[view.name] = render_truth(scene, view.camera)
-            if progress is not None:
-                progress(i + 1, len(chosen))
+    shown = in_threads(lambda view: render_truth(scene, view.camera), chosen, _native.threads())
+    for view, truth in zip(chosen, shown, strict=True):
+        truths[view.name] = truth
+        if progress is not None:
+            progress(len(truths), len(chosen))
     labels = machine_labels(
         scene,
         {view.name: truths[view.name] for view in train},

@@ -28,7 +28,6 @@ other after each. So results do not depend on the number of threads either.
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 
@@ -40,6 +39,7 @@ from torch.nn import functional
 from splatseg import _native
 from splatseg._check import check_finite, check_shape
 from splatseg.core.boundary import boundary
+from splatseg.core.threads import in_threads
 from splatseg.errors import InputError
 from splatseg.methods.cosseg.pyramid import PointPyramid, RandlaConfig
 
@@ -148,10 +148,7 @@ def in_blocks(
     rows = [slice(start, start + size) for start in range(0, len(neighbours), size)]
     threads = min(_native.threads(), len(rows))
     call = partial(_made, make, neighbours)
-    if threads == 1:
-        return _filled(len(neighbours), rows, map(call, rows))
-    with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
-        return _filled(len(neighbours), rows, pool.map(call, rows))
+    return _filled(len(neighbours), rows, in_threads(call, rows, threads))
 
 
 def _filled(count: int, rows: Sequence[slice], parts: Iterable[Tensor]) -> Tensor:
