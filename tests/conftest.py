@@ -13,6 +13,7 @@ from filelock import FileLock
 from hypothesis import HealthCheck, settings
 
 from splatseg.methods import _method
+from splatseg.render.cpu import set_threads, threads
 from support import shared
 from support.drive import write_drive
 from support.products import reorder_all_products, reordered
@@ -155,3 +156,11 @@ def rich_capture(request: pytest.FixtureRequest) -> Path:
 def score(request: pytest.FixtureRequest) -> Callable[..., Score]:
     """A scorer that knows nothing of this project: ours of a few loops, and the shared one."""
     return SCORERS[request.param](SHARED)
+
+
+@pytest.fixture
+def same_threads_afterwards() -> Iterator[None]:
+    """Puts the number of threads back."""
+    before = threads()
+    yield
+    set_threads(before)

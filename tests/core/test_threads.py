@@ -1,5 +1,7 @@
 """Torch's threads inside the library and outside of it."""
 
+import threading
+import time
 from collections.abc import Iterator
 
 import pytest
@@ -9,6 +11,7 @@ from splatseg.core.boundary import boundary
 from splatseg.core.threads import (
     all_torch_threads,
     caller_threads,
+    in_threads,
     network_inference,
     one_torch_thread,
 )
@@ -70,3 +73,32 @@ def _answers() -> tuple[int, bool]:
 def test_inference_has_all_threads_and_no_gradients() -> None:
     assert _answers() == (3, True)
     assert not torch.is_inference_mode_enabled()
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_results_of_threads_come_in_order(threads: int) -> None:
+    def slow_at_first(i: int) -> tuple[int, int]:
+        time.sleep(0.02 if i == 0 else 0)
+        return i, torch.get_num_threads()
+
+    with one_torch_thread():
+        assert list(in_threads(slow_at_first, range(5), threads)) == [(i, 1) for i in range(5)]
+
+
+def test_calls_run_at_the_same_time() -> None:
+    together = threading.Barrier(2)
+    assert len(list(in_threads(lambda _: together.wait(timeout=10), range(2), 2))) == 2
+
+
+def test_no_call_begins_after_an_error() -> None:
+    begun: list[int] = []
+
+    def fails_at_once(i: int) -> None:
+        begun.append(i)
+        if i == 0:
+            raise ValueError("no")
+        time.sleep(0.05)
+
+    with pytest.raises(ValueError, match="no"):
+        list(in_threads(fails_at_once, range(100), 2))
+    assert len(begun) < 10

@@ -1,5 +1,6 @@
 """Evidence written: several kinds of one model, several images at once, depth."""
 
+import threading
 from pathlib import Path
 from typing import ClassVar
 
@@ -15,6 +16,7 @@ from splatseg.io.evidence import open_evidence, save_depth_map, save_label_map
 from splatseg.io.images import load_image
 from splatseg.models import EvidenceRequest, record_evidence, recorded_model
 from splatseg.models._images import LastImages
+from splatseg.render.cpu import set_threads
 
 
 class Counting:
@@ -42,6 +44,45 @@ class Counting:
         height, width = values.shape[:2]
         one = FeatureMap(features=values, stride=1, height=height, width=width)
         return DeepFeatures(maps=(one,), depths=("grey",))
+
+
+class Concurrent:
+    """Masks that are found in one thread an image; each call waits for another one."""
+
+    name, note, concurrent = "concurrent", "", True
+    settings: ClassVar[dict[str, int]] = {}
+
+    def __init__(self, together: int = 1) -> None:
+        self.calls = 0
+        self._barrier = threading.Barrier(together)
+
+    def masks(self, image) -> MaskSet:
+        self.calls += 1
+        self._barrier.wait(timeout=10)
+        return MaskSet.from_dense((image.float().mean(dim=2) > 100)[None])
+
+    def features(self, image) -> DeepFeatures:
+        return Counting().features(image)
+
+
+def test_masks_of_several_views_are_found_at_once(views, tmp_path, same_threads_afterwards) -> None:
+    folders = []
+    for count in (1, 2):
+        set_threads(count)
+        folders.append(tmp_path / str(count))
+        record_evidence(Concurrent(count), views[:2], folders[-1], EvidenceRequest(what="masks"))
+    for name in ("v0", "v1"):
+        one, other = (open_evidence(folder).masks(name) for folder in folders)
+        assert torch.equal(one.dense(0), other.dense(0))
+        expected = load_image(next(v for v in views if v.name == name)).float().mean(dim=2) > 100
+        assert torch.equal(one.dense(0), expected)
+
+
+def test_masks_that_are_there_are_not_found_again(views, tmp_path) -> None:
+    model = Concurrent()
+    record_evidence(model, views, tmp_path / "e", EvidenceRequest(what="masks"))
+    record_evidence(model, views, tmp_path / "e", EvidenceRequest(what=["masks", "features"]))
+    assert model.calls == 3
 
 
 def test_several_kinds_read_each_photograph_once(views, tmp_path) -> None:

@@ -14,7 +14,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from render_scenes import Bench
 
 from splatseg.errors import BackendError
-from splatseg.render.cpu import ISAS, isa, set_isa, set_threads, threads
+from splatseg.render.cpu import ISAS, isa, set_isa
 
 
 def _instruction_sets() -> list[str]:
@@ -79,11 +79,3 @@ def fast_backend(request: pytest.FixtureRequest) -> Iterator[Bench]:
 def reference() -> Bench:
     """The readable backend."""
     return Bench("reference")
-
-
-@pytest.fixture
-def same_threads_afterwards() -> Iterator[None]:
-    """Puts the number of threads back."""
-    before = threads()
-    yield
-    set_threads(before)

@@ -191,6 +191,8 @@ def record_evidence(
                 progress(len(done) + first, len(wanted))
             pictures.forget()
             announce(model, [(target.writer, target.folder) for target in targets], together)
+            for target in targets:
+                target.look(together)
             for view in together:
                 for target in targets:
                     target.write(view)
@@ -265,6 +267,9 @@ class _Target:
     wanted: int
     done: frozenset[str]
     masks: int = 0
+
+    def look(self, views: Sequence[View]) -> None:
+        self.writer.look(self.folder, [view for view in views if view.name not in self.done])
 
     def write(self, view: View) -> None:
         if view.name not in self.done:

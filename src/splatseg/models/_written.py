@@ -113,6 +113,10 @@ class EvidenceWriter(ABC):
     reads: Path | None = None
     """Folder of evidence that is read, which is not to be written to."""
 
+    def look(self, folder: Path, views: Sequence[View]) -> None:
+        """Find what is to be written of several views, where that is quicker than one by one."""
+        return
+
     @abstractmethod
     def write(self, folder: Path, view: View) -> int:
         """Write one view; gives the number of masks, 0 for other kinds."""
@@ -191,9 +195,14 @@ def ability(model: Model, what: str | None) -> str:
     return what
 
 
+def takes_one_thread(model: Model) -> bool:
+    """Whether a model's masks of several images are found at once, each in a thread."""
+    return isinstance(model, ConcurrentMasks) and model.concurrent
+
+
 def batch_of(model: Model) -> int:
     """How many views are looked at together."""
-    if isinstance(model, ConcurrentMasks) and model.concurrent:
+    if takes_one_thread(model):
         return _VIEWS_A_THREAD * _native.threads()
     return max(1, model.batch_size) if isinstance(model, BatchedModel) else 1
 
@@ -203,17 +212,13 @@ def announce(
 ) -> None:
     """Let a model that takes several images at once see those of the next views.
 
-    Images of one size go together. Masks that take one thread an image are found in several.
+    Images of one size go together.
 
     Args:
         model: The model.
         targets: What is asked of it, and the folder that each is written to.
         views: The next views.
     """
-    if isinstance(model, ConcurrentMasks) and model.concurrent:
-        for writer, folder in targets:
-            if isinstance(writer, ComputedEvidence) and writer.what == "masks":
-                writer.find_masks(folder, views)
     if not isinstance(model, BatchedModel) or len(views) < 2:
         return
     images: list[Image] = []
@@ -261,8 +266,10 @@ class ComputedEvidence(EvidenceWriter):
         if knows_words and self._model.words:
             save_text_embeddings(word_vectors(self._model), folder)
 
-    def find_masks(self, folder: Path, views: Sequence[View]) -> None:
-        """Find the masks of several views at once; `write` takes them."""
+    @override
+    def look(self, folder: Path, views: Sequence[View]) -> None:
+        if self.what != "masks" or not takes_one_thread(self._model) or len(views) < 2:
+            return
         calls = [self._call(folder, view) for view in views]
         found = in_threads(lambda call: call(), calls, min(_native.threads(), len(calls)))
         self._found = dict(zip((view.name for view in views), found, strict=True))
