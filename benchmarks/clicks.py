@@ -57,6 +57,7 @@ from splatseg.prompting.feature_source import (
 )
 from splatseg.prompting.prompts import ViewPrompt
 from splatseg.tasks import SelectOptions, open_selector
+from splatseg.tasks.see import prompter_of
 from splatseg.tasks.sources import SelectPostProcessing, SelectThreshold
 
 MOST_CLICKS = 10
@@ -82,7 +83,12 @@ class Bench:
             threshold=args.rule,
             post_processing=args.after,
         )
-        self.session = open_selector(self.scene, options=self.options, source=self._source())
+        prompter = None if args.prompter is None else prompter_of(
+            args.prompter, self.scene, report=print
+        )  # fmt: skip
+        self.session = open_selector(
+            self.scene, options=self.options, source=self._source(), prompter=prompter
+        )
         self.seconds: list[float] = []
 
     def _source(self) -> FeatureMembership | None:
@@ -299,6 +305,7 @@ def main() -> None:
     parser.add_argument("data", type=Path)
     parser.add_argument("--source", default="auto")
     parser.add_argument("--layer")
+    parser.add_argument("--prompter", help="model of source propagate; recorded masks by name")
     parser.add_argument("--threshold", type=float, help="of features, instead of the usual one")
     parser.add_argument("--rule", choices=get_args(SelectThreshold), default="auto")
     parser.add_argument("--after", choices=get_args(SelectPostProcessing), default="auto")

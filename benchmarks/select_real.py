@@ -44,6 +44,7 @@ from splatseg.lift import GaussianField, complete, uplift
 from splatseg.lift.voting.segment_masses import view_masses
 from splatseg.prompting.prompts import ViewPrompt
 from splatseg.tasks import SelectOptions, open_selector
+from splatseg.tasks.see import prompter_of
 
 _SCORER = Path(__file__).resolve().parents[2] / "shared" / "score" / "score.py"
 _ROBOT_VIEWS = 10
@@ -60,11 +61,14 @@ class Asker:
         options: What selections are made from.
     """
 
-    def __init__(self, scene: Scene, masks: Path, options: SelectOptions) -> None:
+    def __init__(
+        self, scene: Scene, masks: Path, options: SelectOptions, *, prompter: str | None = None
+    ) -> None:
         self.scene = scene
         self._folder = masks
         self._options = options
-        self._session = open_selector(scene, options=options)
+        model = None if prompter is None else prompter_of(prompter, scene, report=print)
+        self._session = open_selector(scene, options=options, prompter=model)
 
     def truth(self, view: View) -> Mask:
         """The mask of a view."""
@@ -245,6 +249,7 @@ def main() -> None:
     parser.add_argument("masks", type=Path)
     parser.add_argument("--source", default="masks")
     parser.add_argument("--layer")
+    parser.add_argument("--prompter", help="model of source propagate; recorded masks by name")
     parser.add_argument("--evidence")
     parser.add_argument("--record", help="name under which true masks become evidence")
     parser.add_argument("--rows", nargs="+", default=["click", "group", "clicks3", "mask", "box"])
@@ -256,7 +261,7 @@ def main() -> None:
         _record(load_scene(args.scene), args.masks, args.record)
     evidence = args.evidence or args.record
     options = SelectOptions(source=args.source, from_layer=args.layer, evidence=evidence)
-    asker = Asker(load_scene(args.scene), args.masks, options)
+    asker = Asker(load_scene(args.scene), args.masks, options, prompter=args.prompter)
     train = asker.scene.train_views
     order = np.random.default_rng(args.seed).permutation(len(train))[: args.views]
     for row in args.rows:

@@ -1,13 +1,16 @@
 """The model `regions`: its network, its masks with and without depth, through `see`."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from splatseg.core import MaskSet
-from splatseg.core.models import AutomaticMasks, DepthAwareMasks
+from splatseg.core.models import AutomaticMasks, DepthAwareMasks, Prompt, PromptableMasks
 from splatseg.errors import InputError, ShapeError
 from splatseg.models import find_model
+from splatseg.models._best_masks import embedded_masks
 from splatseg.models._region_masks import KINDS
 from splatseg.models._region_network import (
     CONTOURS,
@@ -185,3 +188,33 @@ def test_hed_s_contours_count() -> None:
     both = learned_masks(grey, every, hed=hed, depth=depth, focal=100.0)
     assert best(both, wanted) > 0.7
     assert not same(both, learned_masks(grey, every, hed=hed))
+
+
+def test_prompts_choose_of_the_masks(squares) -> None:
+    model = Regions()
+    assert isinstance(model, PromptableMasks)
+    embedding = model.embed(squares)
+    every = model.masks(squares)
+    box = torch.tensor(every.masks[0].bbox).float()
+    box[2:] += box[:2]
+    found = model.prompted_masks(embedding, Prompt(box=box))
+    assert torch.equal(found.dense(0), every.dense(0))
+    rows, columns = every.dense(1).nonzero(as_tuple=True)
+    point = torch.tensor([[float(columns[0]) + 0.5, float(rows[0]) + 0.5]])
+    found = model.prompted_masks(embedding, Prompt(points=point))
+    assert 1 <= len(found) <= 3
+    assert all(bool(found.dense(i)[rows[0], columns[0]]) for i in range(len(found)))
+    other = Regions(regions=RegionOptions(max_masks=1))
+    assert len(other.embed(squares).arrays["lengths"]) == 1
+    with pytest.raises(InputError, match="embedding: expected one of model 'regions'"):
+        model.prompted_masks(replace(embedding, model="sam"), Prompt(points=point))
+
+
+def test_no_mask_is_no_answer() -> None:
+    plain = torch.full((40, 60, 3), 128, dtype=torch.uint8)
+    model = Regions()
+    found = model.prompted_masks(
+        embedded_masks(model.name, model.masks(plain).subset([])),
+        Prompt(points=torch.tensor([[5.0, 5.0]])),
+    )
+    assert len(found) == 0

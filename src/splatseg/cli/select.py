@@ -79,9 +79,10 @@ class Command(OnScene):
     """Select an object by prompts: the Gaussians that belong to it become a layer.
 
     Prompts in views are answered from what the scene has: masks that `splatseg see` made,
-    features, or a layer of `splatseg segment`. Pixels have x to the right and y down from the top
-    left corner. Places (--box-3d, --sphere, --lasso) bound the answer, and alone select all
-    inside.
+    features, or a layer of `splatseg segment`; or, with --source propagate, by a model that is
+    asked in a few views (--prompter), without anything prepared. Pixels have x to the right and y
+    down from the top left corner. Places (--box-3d, --sphere, --lasso) bound the answer, and alone
+    select all inside.
 
     The selection becomes SCENE/layers/NAME.npz and replaces an older layer of the name. `splatseg
     render --what NAME`, `edit --layer NAME` and `export --layer NAME` take it.
@@ -93,6 +94,8 @@ class Command(OnScene):
     splatseg select room --point front:200,150 --negative left:40,90 --granularity part --layer lid
 
     splatseg select room --view front --box 120,80,260,210 --save mug.ply --picture clicks
+
+    splatseg select room --view front --point 200,150 --source propagate --prompter regions
 
     splatseg select room --sphere 0.4 0 1.2 0.3 --add-to mug --layer mug
 
@@ -161,8 +164,9 @@ class Command(OnScene):
     """Selection that this one is intersected with."""
 
     prompter: _Model = None
-    """Model that turns points and boxes into masks of their views first, such as sam:
-    NAME[=WEIGHTS][,OPTION=VALUE...]; or recorded masks, by name or folder."""
+    """Model that turns points and boxes into masks of their views first, such as sam, or in up to
+    eight views (--source propagate): NAME[=WEIGHTS][,OPTION=VALUE...], such as regions, hed,
+    classical; or recorded masks, by name or folder."""
 
     download: Downloads = False
     device: Device = "auto"

@@ -20,10 +20,11 @@ from torch import Tensor, nn
 from typing_extensions import override
 
 from splatseg.core import MaskSet
-from splatseg.core.models import Image
+from splatseg.core.models import Embedding, Image, Prompt
 from splatseg.core.threads import network_inference
 from splatseg.errors import FileFormatError, RangeError, import_package
 from splatseg.io.foreign import expect, reading
+from splatseg.models._best_masks import best_embedded_masks, embedded_masks
 from splatseg.models._merge_tree import one_thread
 from splatseg.models._regions import WORKING_SIZE, reduced
 from splatseg.models._weights import Loading
@@ -129,6 +130,15 @@ class Hed(BatchedNetwork[NDArray[np.float32]]):
     def masks(self, image: Image) -> MaskSet:
         """Masks of things and parts by these contours and those of `regions`: `learned_masks`."""
         return learned_masks(image, self._regions, hed=self.contours(image))
+
+    def embed(self, image: Image) -> Embedding:
+        """All masks of the image, of which prompts choose."""
+        return embedded_masks(self.name, self.masks(image))
+
+    def prompted_masks(self, embedding: Embedding, prompt: Prompt) -> MaskSet:
+        """The masks that fit the prompt best, at most three."""
+        embedding.check_model(self.name)
+        return best_embedded_masks(embedding, prompt)
 
     def masks_with_depth(
         self, image: Image, depth: Float[Tensor, "height width"], focal: float

@@ -12,9 +12,10 @@ from torch import Tensor
 from splatseg._check import check_range, check_shape
 from splatseg.core import MaskSet
 from splatseg.core.boundary import boundary
-from splatseg.core.models import Image
+from splatseg.core.models import Embedding, Image, Prompt
 from splatseg.core.options import Count, Share, options
 from splatseg.errors import ShapeError
+from splatseg.models._best_masks import best_embedded_masks, embedded_masks
 from splatseg.models._merge_tree import one_thread
 from splatseg.models._region_masks import masks_of_regions, with_depth, with_hed
 from splatseg.models._region_network import contours_and_boxes, region_network
@@ -78,6 +79,15 @@ class Regions:
     def masks(self, image: Image) -> MaskSet:
         """Masks of things and parts: `learned_masks`."""
         return learned_masks(image, self.regions)
+
+    def embed(self, image: Image) -> Embedding:
+        """All masks of the image, of which prompts choose."""
+        return embedded_masks(self.name, self.masks(image))
+
+    def prompted_masks(self, embedding: Embedding, prompt: Prompt) -> MaskSet:
+        """The masks that fit the prompt best, at most three."""
+        embedding.check_model(self.name)
+        return best_embedded_masks(embedding, prompt)
 
     def masks_with_depth(
         self, image: Image, depth: Float[Tensor, "height width"], focal: float

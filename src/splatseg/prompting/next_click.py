@@ -319,9 +319,7 @@ def choose_views(
         weights: How much each Gaussian matters, 0 or more.
         most: At least 1.
     """
-    rows, heavy = _sample(weights.detach().double().cpu())
-    points = gaussians.means.detach().cpu()[rows].double()
-    shown = torch.tensor([_weight_in_image(view, points, heavy) for view in views])
+    shown = torch.tensor(in_image(gaussians.means.detach().cpu(), views, weights))
     candidates = torch.nonzero(shown > 0).squeeze(1)
     if len(candidates) <= most:
         order = torch.argsort(shown[candidates], descending=True, stable=True)
@@ -337,6 +335,15 @@ def choose_views(
         further = torch.linalg.vector_norm(centres - centres[chosen[-1]], dim=1)
         distance = torch.minimum(distance, further)
     return [views[int(candidates[i])] for i in chosen]
+
+
+def in_image(
+    means: Float[Tensor, "n 3"], views: Sequence[View], weights: Float[Tensor, "n"]
+) -> list[float]:
+    """How much weight of Gaussians at some places is in each view's image, occlusion aside."""
+    rows, heavy = _sample(weights.detach().double().cpu())
+    points = means[rows].double()
+    return [_weight_in_image(view, points, heavy) for view in views]
 
 
 def _sample(weights: Tensor) -> tuple[Tensor, Tensor]:

@@ -32,9 +32,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from splatseg._check import check_values
-from splatseg.core import Gaussians, LabelMap, Selection, View
+from splatseg.core import Gaussians, Selection, View
 from splatseg.errors import InputError, ShapeError
-from splatseg.lift.voting.segment_masses import view_masses
 from splatseg.neighbours import NeighbourIndex, Subset
 from splatseg.prompting import next_click as _clicks
 from splatseg.prompting.graph import (
@@ -64,7 +63,7 @@ _JOINING = 0.25
 _ROUNDING = 1e-6
 """Nearest distances are float32; their rounding does not decide what is as far as one of them."""
 
-_POINTED_AT = 0.1
+POINTED_AT = 0.1
 """Least blending weight of a Gaussian in a pixel that points at it."""
 
 _IN, _OUT = 0.501, 0.499
@@ -181,7 +180,7 @@ class SelectionContext:
             if prompt.guessed:
                 continue
             rows = prompt.positive_rows if positive else prompt.negative_rows
-            mask[rows.ids[rows.weights >= _POINTED_AT].long().cpu()] = True
+            mask[rows.ids[rows.weights >= POINTED_AT].long().cpu()] = True
         return Selection(mask=mask)
 
 
@@ -358,16 +357,7 @@ def _by_masks(
     for prompt in context.prompts:
         if prompt.inside is None or prompt.guessed:
             continue
-        labels = LabelMap(ids=prompt.inside.to(torch.int32))
-        # Rows of what the view shows, which after an edit are not the scene's.
-        shown = context.views.shown(prompt.view)
-        found = view_masses(
-            shown.gaussians, prompt.view.camera, labels, backend=context.views.backend
-        )
-        own = found.segment == 1
-        within, visible = torch.zeros(2, len(context.gaussians))
-        within.index_add_(0, shown.rows[found.gaussian[own]], found.weight[own])
-        visible.index_add_(0, shown.rows, found.visible)
+        within, visible = context.views.mask_masses(prompt.view, prompt.inside)
         seen = visible > _SEEN
         good = seen & (within >= _INSIDE * visible)
         bad = seen & (within < _INSIDE * visible)

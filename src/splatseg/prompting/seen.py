@@ -25,6 +25,7 @@ from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.options import Count
 from splatseg.errors import InputError
 from splatseg.lift.label_maps import view_label_map
+from splatseg.lift.voting.segment_masses import view_masses
 from splatseg.prompting.prompts import Lasso, Solid, ViewPrompt, pixels_in_box
 from splatseg.render import PreparedView, SparseWeights, prepare
 
@@ -133,6 +134,20 @@ class ViewCache:
         ids = edited.rows.to(found.ids.device)[found.ids.long()].int()
         return replace(found, ids=ids, gaussians=len(self._gaussians))
 
+    def mask_masses(
+        self, view: View, mask: Bool[Tensor, "height width"]
+    ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
+        """What a view shows of each Gaussian inside a mask, and at all: sums of weights, pixels."""
+        # Rows of what the view shows, which after an edit are not the scene's.
+        shown = self.shown(view)
+        labels = LabelMap(ids=mask.to(torch.int32))
+        found = view_masses(shown.gaussians, view.camera, labels, backend=self._backend)
+        own = found.segment == 1
+        within, visible = torch.zeros(2, len(self._gaussians))
+        within.index_add_(0, shown.rows[found.gaussian[own]], found.weight[own])
+        visible.index_add_(0, shown.rows, found.visible)
+        return within, visible
+
     def label_map(self, view: View, labels: Labels) -> LabelMap:
         """What a view shows of labels of the Gaussians."""
         edited = self._edited(view)
@@ -185,6 +200,9 @@ class VisiblePrompt:
 
     inside: Bool[Tensor, "height width"] | None = None
     """The box or mask that the thing lies inside in this view, all its pixels."""
+
+    masked: bool = False
+    """Whether a mask was drawn in this view, which `inside` has."""
 
     guessed: bool = False
     """Whether the positive pixels are those in the middle of a box, and nobody showed them."""
@@ -326,6 +344,7 @@ def _seen_points(cache: ViewCache, prompt: ViewPrompt, inside: Tensor | None) ->
         positive=prompt.signs,
         dense=False,
         inside=inside,
+        masked=prompt.mask is not None,
     )
 
 
@@ -356,6 +375,7 @@ def _seen_region(
         positive=torch.cat([torch.full((len(pixels),), on) for _, pixels, on in parts]),
         dense=True,
         inside=inside,
+        masked=prompt.mask is not None,
         guessed=any(name == "box" for name, _, _ in shown),
     )
 

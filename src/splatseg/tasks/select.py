@@ -42,6 +42,7 @@ from splatseg.prompting.prompts import (
     Solid,
     ViewPrompt,
 )
+from splatseg.prompting.propagation import PropagatedMasks
 from splatseg.prompting.seen import ViewCache, VisiblePrompt, see_prompts
 from splatseg.render import BackendName
 from splatseg.tasks.sources import (
@@ -145,7 +146,13 @@ class SelectionSession:
         """
         if self._opened is None:
             self._opened = open_source(
-                SourceRequest(work=self._work, options=self._options, views=self._views)
+                SourceRequest(
+                    work=self._work,
+                    options=self._options,
+                    views=self._views,
+                    neighbours=self._neighbours,
+                    prompter=self._prompter,
+                )
             )
         return self._opened.source
 
@@ -182,7 +189,7 @@ class SelectionSession:
         given = requested = _as_prompts(prompts)
         check_base(self._work.scene, base, options)
         seconds: dict[str, float] = {}
-        if self._prompter is not None:
+        if self._prompter is not None and not self._propagates(given):
             began = time.perf_counter()
             given = segmented_prompts(given, self._prompter, granularity=options.level)
             seconds["prompter"] = time.perf_counter() - began
@@ -196,6 +203,9 @@ class SelectionSession:
             seconds["open"] = time.perf_counter() - began
         context = self._seen(shown, options, seconds)
         confidence = self._membership(context, similar, seconds)
+        if self._opened is not None:
+            # What a source saw may depend on what it was asked.
+            context = replace(context, unseen=getattr(self._opened.source, "unseen", None))
         if draft is not None:
             draft(within(confidence, places))
         if shown or similar:
@@ -216,6 +226,11 @@ class SelectionSession:
             warnings=() if selection.count else ("Nothing is selected.",),
             made_layers=self.made_layers,
         )
+
+    def _propagates(self, given: Sequence[SelectionPrompt]) -> bool:
+        """Whether the source asks the prompter itself."""
+        shown = any(isinstance(prompt, ViewPrompt) for prompt in given)
+        return shown and isinstance(self.source, PropagatedMasks)
 
     def _check_source(self, options: SelectOptions) -> None:
         for name in ("source", "from_layer", "evidence", "threshold"):
@@ -258,7 +273,6 @@ class SelectionSession:
             prompts=seen,
             views=self._views,
             neighbours=self._neighbours,
-            unseen=None if self._opened is None else getattr(self._opened.source, "unseen", None),
             scene_views=self._work.scene.train_views,
             source="" if self._opened is None else self._opened.name,
             published=published,
@@ -304,6 +318,11 @@ class SelectionSession:
         if base is not None:
             details["mode"] = options.mode
             details["base"] = base.info.details.get("prompts", [])
+        if opened is not None and isinstance(opened.source, PropagatedMasks):
+            details["views_asked"] = [
+                {"view": one.view, "agreement": round(one.agreement, 3), "counts": one.accepted}
+                for one in opened.source.looked_at
+            ]
         views = dict.fromkeys(p.view.name for p in prompts if isinstance(p, ViewPrompt | Lasso))
         record: dict[str, JSON] = {
             "source": "" if opened is None else opened.name,

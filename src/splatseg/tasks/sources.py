@@ -17,7 +17,7 @@ from splatseg.core import (
     tree_level,
 )
 from splatseg.core.instance_tree import layer_kind
-from splatseg.core.models import LateTextFeatures, TextFeatures
+from splatseg.core.models import LateTextFeatures, PromptableMasks, TextFeatures
 from splatseg.core.options import Count, Share, options
 from splatseg.errors import InputError, quoted
 from splatseg.io.evidence import TEXT_FILE, FeatureEvidence, evidence_header
@@ -32,8 +32,10 @@ from splatseg.prompting.feature_source import (
     ThresholdRule,
 )
 from splatseg.prompting.layer_source import LayerSource
-from splatseg.prompting.pipeline import MembershipSource, StepName
+from splatseg.prompting.pipeline import MembershipSource, SceneIndex, StepName
+from splatseg.prompting.propagation import PropagatedMasks
 from splatseg.prompting.seen import ViewCache
+from splatseg.tasks.see import shown_image
 from splatseg.tasks.segment import SegmentOptions, segment_work
 from splatseg.tasks.work import Work
 
@@ -72,8 +74,9 @@ class SelectOptions:
     """What a selection is made from, and its post-processing."""
 
     source: str = "auto"
-    """What decides which Gaussians belong together: features, masks or layer. auto takes the first
-    that the scene has: a tree, affinity features, masks, labels."""
+    """What decides which Gaussians belong together: features, masks, layer, or propagate (masks
+    that the prompter makes in up to eight views, one after another). auto takes the first that
+    there is: a tree, affinity features, masks, labels, a prompter."""
 
     from_layer: str | None = None
     """Layer of features, labels or a tree that the source reads. None takes the one of its kind
@@ -184,6 +187,8 @@ class SourceRequest:
     work: Work
     options: SelectOptions
     views: ViewCache
+    neighbours: SceneIndex
+    prompter: PromptableMasks | None = None
 
 
 Opener = Callable[[SourceRequest], OpenedSource | None]
@@ -343,14 +348,38 @@ def _which(work: Work, option: str) -> str:
     return f"{option}: expected one of the sets of masks by name ({names}), got none."
 
 
+def _open_propagate(request: SourceRequest) -> OpenedSource | None:
+    """Masks that the prompter makes in a few views; None without one."""
+    work, views = request.work, request.views
+    if request.prompter is None:
+        if request.options.source == "auto":
+            return None
+        raise InputError(
+            "prompter: expected a model for source propagate, such as classical or recorded masks, "
+            "got none."
+        )
+    source = PropagatedMasks(
+        work.scene.train_views,
+        request.prompter,
+        cache=views,
+        neighbours=request.neighbours,
+        image_of=lambda view: shown_image(view, views.prepared(view)),
+        report=work.observer.note,
+    )
+    return OpenedSource(source=source, name="propagate")
+
+
 OPENERS: dict[str, Opener] = {
     "features": _open_features,
     "layer": _open_layer,
     "masks": _open_masks,
+    "propagate": _open_propagate,
 }
 """Sources by name."""
 
-AUTO: Sequence[Opener] = (_open_tree, _open_features, _open_masks, _open_layer)
+AUTO: Sequence[Opener] = (
+    _open_tree, _open_features, _open_masks, _open_layer, _open_propagate,
+)  # fmt: skip
 """What ``auto`` tries: what answers best comes first, and what has to be made after what is there;
 labels of classes know no things, and come last (docs/decisions/association.md)."""
 
