@@ -185,14 +185,14 @@ def record_evidence(
         ]
         done = frozenset.intersection(*(target.done for target in targets))
         todo = [view for view in wanted if view.name not in done]
+        for target in targets:
+            stack.enter_context(target.begun(todo))
         for first in range(0, len(todo), batch_of(model)):
             together = todo[first : first + batch_of(model)]
             if progress is not None:
                 progress(len(done) + first, len(wanted))
             pictures.forget()
             announce(model, [(target.writer, target.folder) for target in targets], together)
-            for target in targets:
-                target.look(together)
             for view in together:
                 for target in targets:
                     target.write(view)
@@ -268,8 +268,13 @@ class _Target:
     done: frozenset[str]
     masks: int = 0
 
-    def look(self, views: Sequence[View]) -> None:
-        self.writer.look(self.folder, [view for view in views if view.name not in self.done])
+    @contextmanager
+    def begun(self, views: Sequence[View]) -> Generator[None]:
+        self.writer.begin(self.folder, [view for view in views if view.name not in self.done])
+        try:
+            yield
+        finally:
+            self.writer.end()
 
     def write(self, view: View) -> None:
         if view.name not in self.done:

@@ -1,8 +1,9 @@
 """Evidence view by view: from a model that is run, or copied from what others recorded."""
 
 import shutil
+import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
@@ -71,10 +72,6 @@ _QUESTIONS: dict[str, tuple[type[Any], EvidenceKind, str]] = {
 }
 """The protocol of a question and the kind of evidence that it makes, the most telling first."""
 
-_VIEWS_A_THREAD = 2
-"""Of views whose masks are found in several threads: some wait less for others, and little is lost
-when the work is stopped."""
-
 _SEGMENT_PARTS = ".segments"
 """Folder of the segments of single views while panoptic evidence is being written."""
 
@@ -113,8 +110,12 @@ class EvidenceWriter(ABC):
     reads: Path | None = None
     """Folder of evidence that is read, which is not to be written to."""
 
-    def look(self, folder: Path, views: Sequence[View]) -> None:
-        """Find what is to be written of several views, where that is quicker than one by one."""
+    def begin(self, folder: Path, views: Sequence[View]) -> None:
+        """These views will be written next, in this order."""
+        return
+
+    def end(self) -> None:
+        """No view is written any more, perhaps of an error."""
         return
 
     @abstractmethod
@@ -195,15 +196,8 @@ def ability(model: Model, what: str | None) -> str:
     return what
 
 
-def takes_one_thread(model: Model) -> bool:
-    """Whether a model's masks of several images are found at once, each in a thread."""
-    return isinstance(model, ConcurrentMasks) and model.concurrent
-
-
 def batch_of(model: Model) -> int:
     """How many views are looked at together."""
-    if takes_one_thread(model):
-        return _VIEWS_A_THREAD * _native.threads()
     return max(1, model.batch_size) if isinstance(model, BatchedModel) else 1
 
 
@@ -256,8 +250,10 @@ class ComputedEvidence(EvidenceWriter):
             self.settings = {"depth_from_scene": True}
         self._counts: dict[str, int] = {}
         """Masks by view, for the notes."""
-        self._found: dict[str, Any] = {}
-        """Masks of views that are not written yet."""
+        self._ahead: Generator[Any] | None = None
+        """Masks of the next views, which other threads find."""
+        self._one_view = threading.Lock()
+        """Pictures and depths are read and drawn by one thread at a time."""
 
     @override
     def start(self, folder: Path, views: Sequence[View]) -> None:
@@ -267,25 +263,29 @@ class ComputedEvidence(EvidenceWriter):
             save_text_embeddings(word_vectors(self._model), folder)
 
     @override
-    def look(self, folder: Path, views: Sequence[View]) -> None:
-        if self.what != "masks" or not takes_one_thread(self._model) or len(views) < 2:
-            return
-        calls = [self._call(folder, view) for view in views]
-        found = in_threads(lambda call: call(), calls, min(_native.threads(), len(calls)))
-        self._found = dict(zip((view.name for view in views), found, strict=True))
+    def begin(self, folder: Path, views: Sequence[View]) -> None:
+        concurrent = isinstance(self._model, ConcurrentMasks) and self._model.concurrent
+        if self.what == "masks" and concurrent and len(views) > 1:
+            threads = min(_native.threads(), len(views))
+            self._ahead = in_threads(partial(self._found, folder), views, threads)
 
-    def _call(self, folder: Path, view: View) -> Callable[[], Any]:
-        """What asks the model, once the picture and depth of a view are there."""
-        image = self.pictures.of(view, folder)
-        if self._depth_of is None:
-            return partial(getattr(self._model, _QUESTIONS[self.what][2]), image)
-        return partial(self._model.masks_with_depth, image, self._depth_of(view), view.camera.fx)
+    @override
+    def end(self) -> None:
+        if self._ahead is not None:
+            self._ahead.close()
+
+    def _found(self, folder: Path, view: View) -> Any:
+        """What the model says of a view."""
+        with self._one_view:
+            image = self.pictures.of(view, folder)
+            depth = None if self._depth_of is None else self._depth_of(view)
+        if depth is not None:
+            return self._model.masks_with_depth(image, depth, view.camera.fx)
+        return getattr(self._model, _QUESTIONS[self.what][2])(image)
 
     @override
     def write(self, folder: Path, view: View) -> int:
-        found = self._found.pop(view.name, None)
-        if found is None:
-            found = self._call(folder, view)()
+        found = self._found(folder, view) if self._ahead is None else next(self._ahead)
         maps: Sequence[Any] = (found,)
         if isinstance(found, DeepFeatures | Panoptic):
             maps = found.maps if isinstance(found, DeepFeatures) else (found.ids,)
