@@ -16,8 +16,8 @@ is positive outside and 0 on the surface. Labels say whose surface a pixel sees:
     another's, further behind        w = epsilon, d = 1: perhaps outside
 
 The last two decide only where no view sees the voxel: there F is a vote of silhouettes, which
-closes the surface under a thing that stands on a table. F is 1 where no view looks, and beyond the
-box of the object.
+closes the surface under a thing that stands on a table. F is 1 where no view looks; beyond the box
+of the object also where none looks as far as a voxel behind its surface.
 """
 
 from collections.abc import Sequence
@@ -45,7 +45,7 @@ _UNSEEN = 0.02
 """epsilon: fifty views that do not see a voxel count as one that does."""
 
 _BEHIND = 1.0
-"""How far behind another's surface a voxel is inside of that for sure, in voxels."""
+"""How far behind a surface a voxel is seen, in voxels: it is inside of what has the surface."""
 
 _SMOOTHING = 0.7
 """Standard deviation of the Gaussian that smooths F, in voxels: cubes at the border between two
@@ -119,7 +119,7 @@ class Grid:
         shape = inside + 2 * around
         turned = rotation.double().cpu()
         corner = torch.from_numpy((1 - shape) / 2 * voxel)
-        one, two, three = (slice(around - 1, around + int(n) + 1) for n in inside)
+        one, two, three = (slice(around, around + int(n)) for n in inside)
         return cls(
             origin=centre.double().cpu() + turned @ corner,
             axes=turned,
@@ -179,17 +179,17 @@ def signed_distances(maps: Sequence[ViewMaps], id: int, grid: Grid) -> Array:
     from scipy import ndimage
 
     total, weight = (np.zeros(grid.shape, np.float32) for _ in range(2))
+    direct = np.zeros(grid.shape, np.bool_)
     slab = max(1, _SLAB // (grid.shape[1] * grid.shape[2]))
     for one in maps:
         depth, own = one.depth.numpy(), one.ids.numpy() == id
         for start in range(0, grid.shape[0], slab):
             rows = slice(start, min(start + slab, grid.shape[0]))
-            _add(one, depth, own, grid, rows, total[rows], weight[rows])
+            direct[rows] |= _add(one, depth, own, grid, rows, total[rows], weight[rows])
     distances = np.divide(total, weight, out=np.ones_like(total), where=weight > 0)
-    # Silhouettes alone say nothing of what is beyond the box.
-    unseen = weight < 1
-    unseen[grid.inner] = False
-    distances[unseen] = 1
+    # What lies behind a surface says nothing of what is beyond the box: the table below it.
+    direct[grid.inner] = True
+    distances[~direct] = 1
     return ndimage.gaussian_filter(distances, _SMOOTHING, mode="constant", cval=1.0)
 
 
@@ -201,8 +201,12 @@ def _add(
     rows: slice,
     total: Array,
     weight: Array,
-) -> None:
-    """Add what one view says of some planes of the grid to the sums of w d and of w."""
+) -> NDArray[np.bool_]:
+    """Add what one view says of some planes of the grid to the sums of w d and of w.
+
+    Returns:
+        Which voxels the view sees.
+    """
     column, row, z, seen = _projected(maps, grid, rows)
     pixel = row * depth.shape[1] + column
     surface, mine = depth.reshape(-1)[pixel], own.reshape(-1)[pixel]
@@ -211,13 +215,14 @@ def _add(
     surface = np.where(surface > 0, surface, np.where(mine, np.nan, np.inf))
     ahead = (surface - z) / np.float32(grid.voxel)
     with np.errstate(invalid="ignore"):
-        near = np.where(mine, ahead > -_TRUNCATION, ahead > -_BEHIND)
+        near = ahead > np.where(mine, np.float32(-_TRUNCATION), np.float32(-_BEHIND))
         value = np.where(mine, np.minimum(ahead / _TRUNCATION, 1), np.float32(1))
     value = np.where(near, value, np.where(mine, np.float32(-1), np.float32(1)))
     seen &= ~np.isnan(ahead)
     share = np.where(seen, np.where(near, np.float32(1), np.float32(_UNSEEN)), np.float32(0))
     total += np.where(seen, value * share, 0)
     weight += share
+    return seen & (ahead > -_BEHIND)
 
 
 def _projected(
