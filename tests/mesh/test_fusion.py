@@ -99,6 +99,19 @@ def test_small_pieces_are_left_out() -> None:
     assert float(made.vertices[:, 1].max()) < 0.33
 
 
+def test_a_sheet_on_the_table_has_a_surface() -> None:
+    """It has no thickness that a voxel could show, and is made a few voxels thick."""
+    low, high = (-0.3, -0.2, 0.0), (0.3, 0.2, 0.001)
+    made = fuse_object(seen(box(low, high), ring((0.0, 0.0, 0.0))), OBJECT,
+                       grid(low, high, resolution=48))  # fmt: skip
+    assert made is not None
+    assert made.is_watertight
+    size = made.vertices.amax(0) - made.vertices.amin(0)
+    assert torch.allclose(size[:2], torch.tensor([0.6, 0.4]).double(), atol=3 * 0.6 / 48)
+    assert float(made.vertices[:, 2].max()) < 0.6 / 48
+    assert float(size[2]) < 4 * 0.6 / 48
+
+
 def test_an_object_that_no_pixel_shows_has_no_surface(maps_of_box) -> None:
     assert fuse_object(maps_of_box, 99, grid(*BOX, resolution=20)) is None
     assert fuse_object([], OBJECT, grid(*BOX, resolution=20)) is None

@@ -57,6 +57,9 @@ _MIN_COMPONENT = 0.03
 _MIN_RESOLUTION = 16
 """Voxels that the longest side has at least, however small the object is in the views."""
 
+_MIN_THICKNESS = 4
+"""Voxels that every side of a box has at least: of a sheet, half of them behind its surface."""
+
 _SLAB = 1 << 18
 """Voxels that are looked at together: about 20 MB."""
 
@@ -115,7 +118,7 @@ class Grid:
             resolution = min(resolution, max(_MIN_RESOLUTION, int(longest / min_voxel)))
         voxel = longest / resolution
         around = int(np.ceil(_PADDING * resolution)) + 1
-        inside = np.maximum(np.ceil(lengths / voxel).astype(int), 1)
+        inside = np.maximum(np.ceil(lengths / voxel).astype(int), _MIN_THICKNESS)
         shape = inside + 2 * around
         turned = rotation.double().cpu()
         corner = torch.from_numpy((1 - shape) / 2 * voxel)
@@ -187,10 +190,13 @@ def signed_distances(maps: Sequence[ViewMaps], id: int, grid: Grid) -> Array:
             rows = slice(start, min(start + slab, grid.shape[0]))
             direct[rows] |= _add(one, depth, own, grid, rows, total[rows], weight[rows])
     distances = np.divide(total, weight, out=np.ones_like(total), where=weight > 0)
-    # What lies behind a surface says nothing of what is beyond the box: the table below it.
+    # What lies behind a surface says nothing of what is beyond the box: the table below it. A
+    # voxel's worth of distance puts the surface onto the box.
     direct[grid.inner] = True
-    distances[~direct] = 1
-    return ndimage.gaussian_filter(distances, _SMOOTHING, mode="constant", cval=1.0)
+    distances = np.where(direct, distances, np.maximum(distances, 1 / _TRUNCATION))
+    return ndimage.gaussian_filter(
+        distances.astype(np.float32), _SMOOTHING, mode="constant", cval=1.0
+    )
 
 
 def _add(

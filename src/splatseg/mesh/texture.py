@@ -153,7 +153,7 @@ def _mean_colours(
             rows = slice(start, start + _CHUNK)
             cosine, pixels = _visible(one, depth, own, points[rows], towards[rows], tolerance)
             hit = np.flatnonzero(cosine)
-            total[start + hit] += cosine[hit, None] * _bilinear(colour, pixels[hit])
+            total[start + hit] += cosine[hit, None] * _bilinear(colour, own, pixels[hit])
             weight[rows] += cosine
     seen = weight > 0
     return total / np.where(seen, weight, 1)[:, None], seen
@@ -179,16 +179,27 @@ def _visible(
     return np.where(inside & (cosine >= _MIN_COSINE), cosine, 0.0), pixels
 
 
-def _bilinear(image: NDArray[np.uint8], pixels: Array) -> Array:
-    """Colours between the centres of pixels."""
-    height, width = image.shape[:2]
+def _bilinear(image: NDArray[np.uint8], own: NDArray[np.bool_], pixels: Array) -> Array:
+    """Colours between the centres of pixels, of those alone that show the object.
+
+    The pixel that a point falls into has a weight of at least a quarter, and shows it.
+    """
+    height, width = own.shape
     at = np.clip(pixels - 0.5, 0, [width - 1, height - 1])
     low = np.floor(at).astype(np.int64)
-    high = np.minimum(low + 1, [width - 1, height - 1])
-    right, down = ((at - low)[:, i, None] for i in (0, 1))
-    above = image[low[:, 1], low[:, 0]] * (1 - right) + image[low[:, 1], high[:, 0]] * right
-    below = image[high[:, 1], low[:, 0]] * (1 - right) + image[high[:, 1], high[:, 0]] * right
-    return above * (1 - down) + below * down
+    right, down = (at - low).T
+    total, weight = np.zeros((len(pixels), 3)), np.zeros(len(pixels))
+    for step, share in (
+        ((0, 0), (1 - right) * (1 - down)),
+        ((1, 0), right * (1 - down)),
+        ((0, 1), (1 - right) * down),
+        ((1, 1), right * down),
+    ):
+        column, row = np.minimum(low + step, [width - 1, height - 1]).T
+        share = share * own[row, column]
+        total += share[:, None] * image[row, column]
+        weight += share
+    return total / weight[:, None]
 
 
 @boundary
