@@ -168,9 +168,7 @@ def sample(mesh: TriangleMesh) -> tuple[Array, NDArray[np.int64]]:
 def tell(rows: list[Scored], table: dict, *, seconds: float, peak: float) -> None:
     made = len(table["objects"])
     print(f"{made} meshes, {len(table['without_mesh'])} without, {seconds:.0f} s, {peak:.1f} GB")
-    print(
-        "| things | complete 1 cm | 2 cm | accurate 1 cm | 2 cm | to mesh mm | to truth mm | closed |"
-    )
+    print("| things | complete 1 cm | 2 cm | accurate 1 cm | 2 cm | to mesh | to truth | closed |")
     print("|---|---|---|---|---|---|---|---|")
     groups = (
         ("all", rows),
@@ -194,9 +192,11 @@ def line(rows: list[Scored]) -> str:
     """Means of shares, medians of distances."""
     shares = [statistics.mean(row.complete[i] for row in rows) for i in (0, 1)]
     shares += [statistics.mean(row.accurate[i] for row in rows) for i in (0, 1)]
-    lengths = [np.nanmedian([getattr(row, name) for row in rows]) for name in ("to_mesh", "to_truth")]
+    lengths = [
+        np.nanmedian([getattr(row, name) for row in rows]) for name in ("to_mesh", "to_truth")
+    ]
     closed = statistics.mean(row.closed for row in rows)
-    words = [f"{share:.1%}" for share in shares] + [f"{length:.1f}" for length in lengths]
+    words = [f"{share:.1%}" for share in shares] + [f"{length:.1f} mm" for length in lengths]
     return " | ".join([*words, f"{closed:.0%}"])
 
 
@@ -209,8 +209,8 @@ def draw(out: Path, picture: Path, *, side: int = 300) -> None:
             out / entry["file"], read_ply_header(out / entry["file"]), ["vertex"]
         )["vertex"].numbers
         colours = np.stack([table[name] for name in ("red", "green", "blue")], axis=1)
-        for azimuth in (40.0, 220.0):
-            columns.append(np.concatenate(shaded(mesh, colours, azimuth, side)))
+        sides = (shaded(mesh, colours, azimuth, side) for azimuth in (40.0, 220.0))
+        columns.extend(np.concatenate(images) for images in sides)
     Image.fromarray(np.concatenate(columns, axis=1)).save(picture, optimize=True)
 
 

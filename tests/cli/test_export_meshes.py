@@ -45,12 +45,8 @@ def scene(tmp_path_factory):
     views = tuple(View(name=f"v{i}", camera=c, split="train") for i, c in enumerate(cameras))
     root = tmp_path_factory.mktemp("ball") / "scene"
     classes = ClassTable(rows=(ClassInfo(id=5, name="toy", colour=(1, 2, 3)),))
-    save_scene(
-        Scene(gaussians=gaussians, views=views, up=(0.0, 0.0, 1.0), classes=classes), root
-    )
-    info = LayerInfo(
-        names={BALL: "red ball", FLOOR: "floor", STRAY: "stray"}, class_of={BALL: 5}
-    )
+    save_scene(Scene(gaussians=gaussians, views=views, up=(0.0, 0.0, 1.0), classes=classes), root)
+    info = LayerInfo(names={BALL: "red ball", FLOOR: "floor", STRAY: "stray"}, class_of={BALL: 5})
     layer = Labels(ids=torch.from_numpy(ids).int(), confidence=torch.ones(len(ids)), info=info)
     save_scene_layer(layer, root, "objects")
     return root

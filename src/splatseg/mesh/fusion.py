@@ -22,6 +22,7 @@ of the object also where none looks as far as a voxel behind its surface.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 import torch
@@ -177,58 +178,65 @@ def pixel_size(maps: Sequence[ViewMaps], id: int) -> float:
     return float(np.median(sizes)) if sizes else 0.0
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Sums:
+    """What views said of voxels so far."""
+
+    total: Array
+    """Sum of w d."""
+
+    weight: Array
+    """Sum of w."""
+
+    direct: NDArray[np.bool_]
+    """Whether a view looks there, as far as a voxel behind a surface."""
+
+
 def signed_distances(maps: Sequence[ViewMaps], id: int, grid: Grid) -> Array:
     """F at each voxel, smoothed."""
     from scipy import ndimage
 
-    total, weight = (np.zeros(grid.shape, np.float32) for _ in range(2))
-    direct = np.zeros(grid.shape, np.bool_)
+    sums = _Sums(
+        total=np.zeros(grid.shape, np.float32),
+        weight=np.zeros(grid.shape, np.float32),
+        direct=np.zeros(grid.shape, np.bool_),
+    )
     slab = max(1, _SLAB // (grid.shape[1] * grid.shape[2]))
     for one in maps:
-        depth, own = one.depth.numpy(), one.ids.numpy() == id
+        own = one.ids.numpy() == id
         for start in range(0, grid.shape[0], slab):
-            rows = slice(start, min(start + slab, grid.shape[0]))
-            direct[rows] |= _add(one, depth, own, grid, rows, total[rows], weight[rows])
-    distances = np.divide(total, weight, out=np.ones_like(total), where=weight > 0)
+            _add(sums, one, own, grid, slice(start, min(start + slab, grid.shape[0])))
+    distances = np.divide(
+        sums.total, sums.weight, out=np.ones_like(sums.total), where=sums.weight > 0
+    )
     # What lies behind a surface says nothing of what is beyond the box: the table below it. A
     # voxel's worth of distance puts the surface onto the box.
+    direct = sums.direct
     direct[grid.inner] = True
-    distances = np.where(direct, distances, np.maximum(distances, 1 / _TRUNCATION))
-    return ndimage.gaussian_filter(
-        distances.astype(np.float32), _SMOOTHING, mode="constant", cval=1.0
-    )
+    distances = np.where(direct, distances, np.maximum(distances, np.float32(1 / _TRUNCATION)))
+    smooth = ndimage.gaussian_filter(distances, _SMOOTHING, mode="constant", cval=1.0)
+    return cast(Array, smooth)
 
 
-def _add(
-    maps: ViewMaps,
-    depth: Array,
-    own: NDArray[np.bool_],
-    grid: Grid,
-    rows: slice,
-    total: Array,
-    weight: Array,
-) -> NDArray[np.bool_]:
-    """Add what one view says of some planes of the grid to the sums of w d and of w.
-
-    Returns:
-        Which voxels the view sees.
-    """
+def _add(sums: _Sums, maps: ViewMaps, own: NDArray[np.bool_], grid: Grid, rows: slice) -> None:
+    """Add what one view says of some planes of the grid."""
     column, row, z, seen = _projected(maps, grid, rows)
+    depth = maps.depth.numpy()
     pixel = row * depth.shape[1] + column
     surface, mine = depth.reshape(-1)[pixel], own.reshape(-1)[pixel]
     # Nothing is seen in a pixel without a depth: all of its ray is free, unless it shows the
     # object, which then is too transparent to say where it is.
     surface = np.where(surface > 0, surface, np.where(mine, np.nan, np.inf))
-    ahead = (surface - z) / np.float32(grid.voxel)
+    ahead = ((surface - z) / grid.voxel).astype(np.float32)
     with np.errstate(invalid="ignore"):
         near = ahead > np.where(mine, np.float32(-_TRUNCATION), np.float32(-_BEHIND))
         value = np.where(mine, np.minimum(ahead / _TRUNCATION, 1), np.float32(1))
     value = np.where(near, value, np.where(mine, np.float32(-1), np.float32(1)))
     seen &= ~np.isnan(ahead)
     share = np.where(seen, np.where(near, np.float32(1), np.float32(_UNSEEN)), np.float32(0))
-    total += np.where(seen, value * share, 0)
-    weight += share
-    return seen & (ahead > -_BEHIND)
+    sums.total[rows] += np.where(seen, value * share, 0)
+    sums.weight[rows] += share
+    sums.direct[rows] |= seen & (ahead > -_BEHIND)
 
 
 def _projected(
@@ -264,11 +272,11 @@ def _pieces(inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Large pieces, without the hollows that nobody sees into."""
     from scipy import ndimage
 
-    pieces, _ = ndimage.label(inside)
+    pieces, _ = cast("tuple[NDArray[np.int32], int]", ndimage.label(inside))
     counts = np.bincount(pieces.ravel())
     counts[0] = 0
     large = counts >= _MIN_COMPONENT * max(1, counts.max())
-    return ndimage.binary_fill_holes(large[pieces])
+    return cast(NDArray[np.bool_], ndimage.binary_fill_holes(large[pieces]))
 
 
 def _isosurface(distances: Array, grid: Grid) -> TriangleMesh:

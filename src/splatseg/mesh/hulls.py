@@ -40,7 +40,9 @@ class _Hull:
 
 
 @boundary
-def convex_hulls(surface: TriangleMesh, *, coarse: TriangleMesh | None = None) -> tuple[TriangleMesh, ...]:
+def convex_hulls(
+    surface: TriangleMesh, *, coarse: TriangleMesh | None = None
+) -> tuple[TriangleMesh, ...]:
     """Convex hulls of the parts that a surface is cut into, which contain all its vertices.
 
     Parts are those of CoACD (Wei et al., Approximate Convex Decomposition for 3D Meshes with
@@ -94,6 +96,4 @@ def _grown(hulls: list[_Hull], points: Array) -> list[_Hull]:
 def _hull_of(points: Array) -> _Hull:
     trimesh: Any = import_package("trimesh", "collision hulls", "mesh")
     hull = trimesh.PointCloud(points).convex_hull
-    return _Hull(
-        vertices=np.array(hull.vertices, np.float64), faces=np.array(hull.faces, np.int64)
-    )
+    return _Hull(vertices=np.array(hull.vertices, np.float64), faces=np.array(hull.faces, np.int64))

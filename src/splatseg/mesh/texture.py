@@ -9,6 +9,7 @@ sees have the mean of their triangle's.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 import torch
@@ -21,6 +22,7 @@ from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, import_package
 from splatseg.io.export import TriangleMesh
 from splatseg.mesh.maps import ViewMaps
+from splatseg.neighbours import NeighbourIndex
 
 _MIN_COSINE = 0.1
 """Views along the surface do not count: a pixel of theirs covers too much of it."""
@@ -133,10 +135,9 @@ def seen_colours(
     mean, seen = _mean_colours(xyz, normals.double().cpu().numpy(), maps, id, tolerance)
     colours = np.rint(mean).clip(0, 255).astype(np.uint8)
     if seen.any() and not seen.all():
-        from scipy.spatial import cKDTree
-
-        _, nearest = cKDTree(xyz[seen]).query(xyz[~seen])
-        colours[~seen] = colours[seen][nearest]
+        index = NeighbourIndex(torch.from_numpy(xyz[seen]))
+        nearest = index.nearest(torch.from_numpy(xyz[~seen]), 1).indices[:, 0]
+        colours[~seen] = colours[seen][nearest.numpy()]
     return SeenColours(colours=torch.from_numpy(colours), seen=torch.from_numpy(seen))
 
 
@@ -148,10 +149,10 @@ def _mean_colours(
     towards = normals / np.where(length > 0, length, 1)
     total, weight = np.zeros((len(points), 3)), np.zeros(len(points))
     for one in maps:
-        depth, own, colour = one.depth.numpy(), one.ids.numpy() == id, one.colour.numpy()
+        own, colour = one.ids.numpy() == id, one.colour.numpy()
         for start in range(0, len(points), _CHUNK):
             rows = slice(start, start + _CHUNK)
-            cosine, pixels = _visible(one, depth, own, points[rows], towards[rows], tolerance)
+            cosine, pixels = _visible(one, own, points[rows], towards[rows], tolerance=tolerance)
             hit = np.flatnonzero(cosine)
             total[start + hit] += cosine[hit, None] * _bilinear(colour, own, pixels[hit])
             weight[rows] += cosine
@@ -160,14 +161,10 @@ def _mean_colours(
 
 
 def _visible(
-    maps: ViewMaps,
-    depth: NDArray[np.float32],
-    own: NDArray[np.bool_],
-    points: Array,
-    normals: Array,
-    tolerance: float,
+    maps: ViewMaps, own: NDArray[np.bool_], points: Array, normals: Array, *, tolerance: float
 ) -> tuple[Array, Array]:
     """The cosine towards the camera of each point, 0 where it is not seen; and its pixel (u, v)."""
+    depth = maps.depth.numpy()
     camera = maps.camera
     pixels, z = (found.numpy() for found in camera.project(torch.from_numpy(points)))
     size = np.array([camera.width, camera.height])
@@ -268,7 +265,9 @@ def unwrap(surface: TriangleMesh, texel: float) -> Atlas:
     flat /= max(texel, np.sqrt(area / (_FILLED * _MAX_TEXELS)))
     atlas = xatlas.Atlas()
     atlas.add_uv_mesh(
-        flat.astype(np.float32), corners.astype(np.uint32), face_materials=chart.astype(np.uint32)[:, None]
+        flat.astype(np.float32),
+        corners.astype(np.uint32),
+        face_materials=chart.astype(np.uint32)[:, None],
     )
     packing = xatlas.PackOptions()
     packing.texels_per_unit, packing.padding, packing.bilinear = 1.0, 2, True
@@ -372,7 +371,8 @@ def _dilated(image: NDArray[np.uint8], covered: NDArray[np.bool_]) -> NDArray[np
 
     if not covered.any():
         return image
-    nearest = ndimage.distance_transform_edt(
-        ~covered, return_distances=False, return_indices=True
+    nearest = cast(
+        NDArray[np.int32],
+        ndimage.distance_transform_edt(~covered, return_distances=False, return_indices=True),
     )
-    return image[tuple(nearest)]
+    return image[nearest[0], nearest[1]]

@@ -325,9 +325,7 @@ def choose_views(
     return [views[i] for i in choose_cameras([view.camera for view in views], shown, most=most)]
 
 
-def choose_cameras(
-    cameras: Sequence[Camera], worth: Float[Tensor, "n"], *, most: int
-) -> list[int]:
+def choose_cameras(cameras: Sequence[Camera], worth: Float[Tensor, "n"], *, most: int) -> list[int]:
     """At most `most` cameras of positive worth, far from each other, see `choose_views`.
 
     Args:

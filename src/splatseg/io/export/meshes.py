@@ -8,7 +8,7 @@ glTF turn it to their own up axis, so that an object stands upright in the size 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -255,7 +255,7 @@ def _plain(mesh: TriangleMesh) -> Any:
 
 def _trimesh() -> tuple[Any, Any]:
     trimesh: Any = import_package("trimesh", "writing meshes", "mesh")
-    return trimesh, cast(Any, import_package("trimesh.visual", "writing meshes", "mesh"))
+    return trimesh, import_package("trimesh.visual", "writing meshes", "mesh")
 
 
 def _write_glb(one: ObjectMesh, folder: Path, stem: str, pose: Tensor) -> None:
