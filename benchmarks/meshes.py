@@ -180,11 +180,12 @@ def tell(rows: list[Scored], table: dict, *, seconds: float, peak: float) -> Non
             print(f"| {name} ({len(group)}) | {line(group)} |")
     print("\nby thing, the worst completeness first:")
     for row in sorted(rows, key=lambda row: row.complete[1]):
+        closed = "closed" if row.closed else "open"
         print(
             f"{row.id:4d} {row.name[:34]:34s} {row.size:5.2f} m, seen {row.seen:4.0%}, "
             f"complete {row.complete[0]:4.0%} {row.complete[1]:4.0%}, accurate "
             f"{row.accurate[0]:4.0%} {row.accurate[1]:4.0%}, {row.to_mesh:5.1f} mm, "
-            f"{row.to_truth:5.1f} mm, {row.triangles} triangles, {'closed' if row.closed else 'open'}"
+            f"{row.to_truth:5.1f} mm, {row.triangles} triangles, {closed}"
         )
 
 

@@ -39,7 +39,7 @@ from splatseg.tasks.export_labels import (
     panoptic_frames,
     panoptic_segments,
 )
-from splatseg.tasks.export_meshes import write_meshes
+from splatseg.tasks.export_meshes import export_meshes
 from splatseg.tasks.render import Rendering, RenderingOptions, render_views
 from splatseg.tasks.segment import Segmentation
 from splatseg.tasks.work import EXPORTS_FOLDER, REPORTS_FOLDER, SILENT, Observer, Work
@@ -168,7 +168,7 @@ def _folder_of_objects(job: ExportJob) -> Exported:
 
 
 def _folder_of_meshes(job: ExportJob) -> Exported:
-    files = write_meshes(job)
+    files = export_meshes(job)
     written = "a mesh" if len(files) == 1 else f"{len(files)} meshes"
     return Exported(output=job.output, summary=f"{written} and meshes.json", files=files)
 

@@ -52,7 +52,7 @@ triangles CoACD takes 6 s, of a hundred thousand minutes."""
 _NOTED = 5
 
 
-def write_meshes(job: ExportJob) -> dict[int, str]:
+def export_meshes(job: ExportJob) -> dict[int, str]:
     """Write the folder of meshes; gives the files by object id.
 
     Raises:

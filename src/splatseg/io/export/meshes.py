@@ -19,7 +19,7 @@ from torch import Tensor
 from splatseg._check import check_choice, check_shape
 from splatseg.core import UNLABELLED
 from splatseg.core.boundary import boundary, convert_fields
-from splatseg.errors import InputError, import_package, visible
+from splatseg.errors import InputError, RangeError, import_package, visible
 from splatseg.io.atomic import atomic_folder
 from splatseg.io.export.objects import MADE_BY, ObjectRow, object_content
 from splatseg.io.export.splats import NONE, check_replaceable, object_stem
@@ -155,6 +155,7 @@ def write_object_meshes(
     Raises:
         InputError: If the folder holds something other than an earlier export, no object has a
             mesh, or a mesh has not the colours that the format holds.
+        RangeError: If `up` or `metres_per_unit` cannot be.
         MissingPackageError: If trimesh is not installed.
     """
     check_choice("format", format, tuple(_WRITERS))
@@ -199,10 +200,18 @@ def glb_from_world(
     """The transform of a GLB's node: the smallest turn of `up` to +y, and metres.
 
     An up axis of -y is turned about the x axis. None leaves axes or lengths as they are.
+
+    Raises:
+        RangeError: If the axis has no direction, or the unit is not above 0.
     """
     pose = np.eye(4)
+    if metres_per_unit is not None and not 0 < metres_per_unit < np.inf:
+        raise RangeError(f"metres_per_unit: expected a number above 0, got {metres_per_unit}.")
     if up is not None:
-        axis = np.asarray(up, np.float64) / np.linalg.norm(up)
+        length = float(np.linalg.norm(up))
+        if len(up) != 3 or not 0 < length < np.inf:
+            raise RangeError(f"up: expected a direction of three numbers, got {up}.")
+        axis = np.asarray(up, np.float64) / length
         cosine, across = float(axis @ _UP), np.cross(axis, _UP)
         if cosine < -1 + 1e-9:
             pose[:3, :3] = np.diag([1.0, -1.0, -1.0])
