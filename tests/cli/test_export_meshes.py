@@ -1,4 +1,4 @@
-"""export --what meshes: from a generated room with the labels that its things have."""
+"""export --what meshes: a ball of Gaussians on a floor, as the shell runs it."""
 
 import json
 

@@ -14,6 +14,8 @@ from support.mesh_maps import BLUE, OBJECT, RED, box, grid, ring, seen
 
 BOX = ((-0.3, -0.2, 0.0), (0.3, 0.2, 0.4))
 VOXEL = 0.6 / 40
+AWAY = 1
+"""A view a sixth of a turn from the first."""
 
 
 @pytest.fixture(scope="module")
@@ -110,13 +112,13 @@ def test_views_count_by_the_cosine(maps) -> None:
     dark = replace(one, colour=torch.full_like(one.colour, 50))
     mean = seen_colours(point, towards, [bright, dark], OBJECT, tolerance=0.1)
     assert mean.colours.unique().tolist() == [150]
-    far = replace(maps[3], colour=torch.full_like(one.colour, 50))
+    far = replace(maps[AWAY], colour=torch.full_like(one.colour, 50))
     direction = far.camera.centre - point
     cosine = float((towards * direction).sum() / towards.norm() / direction.norm())
-    if cosine > 0.1:
-        mixed = seen_colours(point, towards, [bright, far], OBJECT, tolerance=10)
-        expected = (250 + 50 * cosine) / (1 + cosine)
-        assert float(mixed.colours.float().mean()) == pytest.approx(expected, abs=1)
+    assert 0.1 < cosine < 0.9
+    mixed = seen_colours(point, towards, [bright, far], OBJECT, tolerance=10)
+    expected = (250 + 50 * cosine) / (1 + cosine)
+    assert float(mixed.colours.float().mean()) == pytest.approx(expected, abs=1)
 
 
 def test_mistakes(maps, mesh, monkeypatch) -> None:

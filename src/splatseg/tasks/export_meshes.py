@@ -2,7 +2,6 @@
 
 from collections.abc import Generator, Sequence
 
-import numpy as np
 import torch
 
 from splatseg.core import Labels, View
@@ -193,4 +192,4 @@ def _coloured(
 
 def _figure(value: float) -> float:
     """Six significant digits, as the tables of objects have."""
-    return float(np.format_float_positional(value, precision=6, fractional=False))
+    return float(f"{value:.6g}")
