@@ -103,6 +103,7 @@ PACKAGES = {
     "importing",
     "io",
     "lift",
+    "mesh",
     "methods",
     "models",
     "neighbours",

@@ -5,6 +5,7 @@ from . import fit as fit
 from . import importing as importing
 from . import io as io
 from . import lift as lift
+from . import mesh as mesh
 from . import methods as methods
 from . import models as models
 from . import neighbours as neighbours

@@ -432,6 +432,7 @@ def special(world: World, by_type: dict[type, Any]) -> dict[str, Any]:
         "io.export.write_column_table.path": world.folder / "columns.json",
         "io.export.write_column_table.content": {},
         "io.export.write_object_splats.folder": world.folder / "objects",
+        "io.export.write_object_meshes.folder": world.folder / "meshes",
         "io.export.label_columns.layer": world.labels,
         "io.export.label_columns.kind": "class",
         "io.export.write_scan_points.path": world.folder / "scan.ply",
@@ -488,6 +489,7 @@ def inner(world: World, by_type: dict[type, Any]) -> dict[str, Any]:
         "io.evidence.save_segments.folder": world.path().parent,
         "io.export.object_content.row": row,
         "io.export.write_object_table.rows": (row,),
+        "io.export.write_object_meshes.objects": (_mesh_of(row),),
         "io.export.check_replaceable.path": world.path(),
         "methods.Method.options": method.options,
         "methods.Method.run": method.run,
@@ -550,6 +552,17 @@ def inner(world: World, by_type: dict[type, Any]) -> dict[str, Any]:
         "tasks.EditOptions.layer": "things",
         "tasks.EditOptions.ids": (1,),
     }
+
+
+def _mesh_of(row: Any) -> Any:
+    """A tetrahedron."""
+    from splatseg.io.export import ImageTexture, ObjectMesh, TriangleMesh
+
+    corners = torch.cat((torch.zeros(1, 3), torch.eye(3))).double()
+    faces = torch.tensor([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
+    colour = ImageTexture(uv=corners[:, :2], image=torch.zeros(4, 4, 3, dtype=torch.uint8))
+    mesh = TriangleMesh(vertices=corners, faces=faces)
+    return ObjectMesh(row=row, mesh=mesh, normals=corners + 0.1, colour=colour, facts={})
 
 
 def argument(known: dict[str, Any], key: str, parameter: inspect.Parameter, hint: Any) -> Any:

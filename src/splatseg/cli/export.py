@@ -30,9 +30,10 @@ class Command(OnScene):
     splat: the Gaussians in one file. A PLY gets the columns class_id, instance_id (int32, 0 for
     none) and confidence (float32), and a table of what the ids mean beside it, FILE.json. Other
     formats hold no such columns. objects: a folder with one splat file per object, and
-    objects.json. points: a labelled point cloud, .ply, .las or .laz. coco: a folder in COCO's
-    panoptic format, drawn in the views of --split. table: the objects with centroid, box,
-    class, colour and confidence, .csv or .json.
+    objects.json. meshes: a folder with one closed, textured mesh per object, and meshes.json.
+    points: a labelled point cloud, .ply, .las or .laz. coco: a folder in COCO's panoptic format,
+    drawn in the views of --split. table: the objects with centroid, box, class, colour and
+    confidence, .csv or .json.
 
     What an earlier export wrote is replaced as a whole; other files are left alone.
 
@@ -42,15 +43,17 @@ class Command(OnScene):
 
     splatseg export room -o objects --what objects --layer objects --only chair,table
 
+    splatseg export room -o meshes --what meshes --layer objects --hulls
+
     splatseg export room -o room.las --what points --layer semantic --min-opacity 0.3
     """
 
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT")]
-    """File to write: .ply, .compressed.ply, .splat, .spz, .sog for splats. Folder for objects and
-    coco."""
+    """File to write: .ply, .compressed.ply, .splat, .spz, .sog for splats. Folder for objects,
+    meshes and coco."""
 
     what: What = "splat"
-    """What to write: splat, objects, points, coco or table."""
+    """What to write: splat, objects, meshes, points, coco or table."""
 
     export: tyro.conf.OmitArgPrefixes[ExportOptions] = field(default_factory=ExportOptions)
     """Layers to export, and formats."""

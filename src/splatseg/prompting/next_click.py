@@ -320,21 +320,35 @@ def choose_views(
         most: At least 1.
     """
     shown = torch.tensor(in_image(gaussians.means.detach().cpu(), views, weights))
+    return [views[i] for i in choose_cameras([view.camera for view in views], shown, most=most)]
+
+
+def choose_cameras(cameras: Sequence[Camera], worth: Float[Tensor, "n"], *, most: int) -> list[int]:
+    """At most `most` cameras of positive worth, far from each other, see `choose_views`.
+
+    Args:
+        cameras: To choose from.
+        worth: What each one shows, 0 or more.
+        most: At least 1.
+
+    Returns:
+        Their indices, in the order of choice.
+    """
+    shown = worth.double().cpu()
     candidates = torch.nonzero(shown > 0).squeeze(1)
     if len(candidates) <= most:
-        order = torch.argsort(shown[candidates], descending=True, stable=True)
-        return [views[int(i)] for i in candidates[order]]
-    centres = torch.stack([view.camera.centre.double() for view in views])[candidates]
-    worth = shown[candidates] / shown.max()
-    chosen = [int(worth.argmax())]
+        return candidates[torch.argsort(shown[candidates], descending=True, stable=True)].tolist()
+    centres = torch.stack([cameras[int(i)].centre.double() for i in candidates])
+    share = shown[candidates] / shown.max()
+    chosen = [int(share.argmax())]
     distance = torch.linalg.vector_norm(centres - centres[chosen[0]], dim=1)
     while len(chosen) < most:
-        score = worth * distance
+        score = share * distance
         score[chosen] = -1
         chosen.append(int(score.argmax()))
         further = torch.linalg.vector_norm(centres - centres[chosen[-1]], dim=1)
         distance = torch.minimum(distance, further)
-    return [views[int(candidates[i])] for i in chosen]
+    return candidates[torch.tensor(chosen)].tolist()
 
 
 def in_image(

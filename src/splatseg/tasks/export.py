@@ -39,6 +39,7 @@ from splatseg.tasks.export_labels import (
     panoptic_frames,
     panoptic_segments,
 )
+from splatseg.tasks.export_meshes import export_meshes
 from splatseg.tasks.render import Rendering, RenderingOptions, render_views
 from splatseg.tasks.segment import Segmentation
 from splatseg.tasks.work import EXPORTS_FOLDER, REPORTS_FOLDER, SILENT, Observer, Work
@@ -58,7 +59,7 @@ class Exported:
     """The file beside it that says what the ids mean."""
 
     files: Mapping[int, str] = field(default_factory=dict[int, str])
-    """With objects: the name of each object's file in the folder, by id."""
+    """With objects and meshes: the name of each object's file in the folder, by id."""
 
 
 @boundary
@@ -80,7 +81,7 @@ def export_scene(
     Args:
         scene: The scene.
         output: File or folder to write.
-        what: splat, objects, points, coco or table, see ``docs/exports.md``.
+        what: splat, objects, meshes, points, coco or table, see ``docs/exports.md``.
         options: Which layers, and how.
         layers: Layers at hand; others are read from the scene's folder.
         files: With table: where each object's splats are, by id; it is said in the table.
@@ -111,6 +112,9 @@ def _check(scene: Scene, output: Path, what: What, options: ExportOptions) -> No
         ("splat_format", options.splat_format is not None, ("splat", "objects")),
         ("unlabelled", options.unlabelled, ("objects",)),
         ("min_opacity", options.min_opacity > 0, ("points",)),
+        ("mesh_format", options.mesh_format is not None, ("meshes",)),
+        ("resolution", options.resolution != ExportOptions().resolution, ("meshes",)),
+        ("hulls", options.hulls, ("meshes",)),
     ):
         if given and what not in kinds:
             raise InputError(f"{name}: goes with an export of {' or '.join(kinds)}, not of {what}.")
@@ -121,6 +125,8 @@ def _check(scene: Scene, output: Path, what: What, options: ExportOptions) -> No
 def _check_place(scene: Scene, output: Path, what: What) -> None:
     if what == "objects":
         check_replaceable(output, "objects.json")
+    elif what == "meshes":
+        check_replaceable(output, "meshes.json")
     elif what == "coco":
         check_replaceable(output, "panoptic.json")
     if scene.root is not None:
@@ -159,6 +165,12 @@ def _folder_of_objects(job: ExportJob) -> Exported:
         summary=f"{counted(len(files), 'object')} and objects.json",
         files={row.id: file.name for row, file in zip(rows, files, strict=True)},
     )
+
+
+def _folder_of_meshes(job: ExportJob) -> Exported:
+    files = export_meshes(job)
+    written = "a mesh" if len(files) == 1 else f"{len(files)} meshes"
+    return Exported(output=job.output, summary=f"{written} and meshes.json", files=files)
 
 
 def _points(job: ExportJob) -> Exported:
@@ -201,6 +213,7 @@ def _coco(job: ExportJob) -> Exported:
 _WRITERS: dict[What, Callable[[ExportJob], Exported]] = {
     "splat": _splat,
     "objects": _folder_of_objects,
+    "meshes": _folder_of_meshes,
     "points": _points,
     "coco": _coco,
     "table": _table,

@@ -3,10 +3,11 @@
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from jaxtyping import Int
+from msgspec import Meta
 from torch import Tensor
 
 from splatseg.core import (
@@ -29,6 +30,7 @@ from splatseg.io.export import (
     BoxMethod,
     Category,
     Frame,
+    MeshFormat,
     ObjectRow,
     SegmentInfo,
     classes_of,
@@ -40,8 +42,10 @@ from splatseg.lift import GaussianField
 from splatseg.report.colours import colour_of, layer_colours, names_of
 from splatseg.tasks.work import Work
 
-What = Literal["splat", "objects", "points", "coco", "table"]
+What = Literal["splat", "objects", "meshes", "points", "coco", "table"]
 _Kind = Literal["class", "instance"]
+Resolution = Annotated[int, Meta(ge=16, le=512)]
+"""Voxels: 512 take 3 GB."""
 
 
 @options
@@ -59,6 +63,16 @@ class ExportOptions:
     splat_format: WritableFormat | None = None
     """Format of splats: ply, compressed.ply, splat, spz, spz3 (SPZ version 3), sog. Default:
     what the file is named, ply for objects."""
+
+    mesh_format: MeshFormat | None = None
+    """Format of meshes: glb (glTF binary, the default), obj, ply."""
+
+    resolution: Resolution = 128
+    """With meshes: voxels along the longest side of an object's box, 16 to 512. Fewer are taken
+    where a voxel would be smaller than a pixel of the views."""
+
+    hulls: bool = False
+    """With meshes: also write convex hulls of each object for collisions."""
 
     only: tuple[str, ...] = ()
     """Only these objects, by id or name. Other Gaussians are left out."""

@@ -4,6 +4,13 @@ from splatseg.io.export.coco import Category as Category
 from splatseg.io.export.coco import Frame as Frame
 from splatseg.io.export.coco import SegmentInfo as SegmentInfo
 from splatseg.io.export.coco import write_coco_panoptic as write_coco_panoptic
+from splatseg.io.export.meshes import ImageTexture as ImageTexture
+from splatseg.io.export.meshes import MeshFormat as MeshFormat
+from splatseg.io.export.meshes import NoMesh as NoMesh
+from splatseg.io.export.meshes import ObjectMesh as ObjectMesh
+from splatseg.io.export.meshes import TriangleMesh as TriangleMesh
+from splatseg.io.export.meshes import VertexColours as VertexColours
+from splatseg.io.export.meshes import write_object_meshes as write_object_meshes
 from splatseg.io.export.objects import BoxMethod as BoxMethod
 from splatseg.io.export.objects import ObjectRow as ObjectRow
 from splatseg.io.export.objects import OrientedBox as OrientedBox

@@ -255,7 +255,7 @@ def write_object_splats(
         gaussians = gaussians.replace(extra=dict(gaussians.extra) | dict(columns))
     ids = labels.ids.cpu()
     digits = max([3, *(len(str(row.id)) for row in rows)])
-    files = [f"{_stem(row, digits)}.{_ENDINGS[format]}" for row in rows]
+    files = [f"{object_stem(row, digits=digits)}.{_ENDINGS[format]}" for row in rows]
     with atomic_folder(folder) as temporary, retold(temporary, folder):
         for row, file in zip(rows, files, strict=True):
             members = torch.nonzero(ids == row.id).squeeze(1)
@@ -275,7 +275,7 @@ def write_object_splats(
     return tuple(folder / file for file in files)
 
 
-def _stem(row: ObjectRow, digits: int) -> str:
+def object_stem(row: ObjectRow, *, digits: int = 3) -> str:
     """A file name of ASCII letters, digits and hyphens that sorts by id."""
     plain = unicodedata.normalize("NFKD", row.name).encode("ascii", "ignore").decode().lower()
     words = re.sub(r"[^a-z0-9]+", "-", plain)[:_LONGEST_NAME].strip("-")
