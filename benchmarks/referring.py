@@ -191,12 +191,8 @@ class TrueRoom:
         """The colour that its name says; None where that has a shade or none."""
         words = self.names[at].split(" on ")[0].split(" at ")[0].split()
         found = [word for word in words if word in _COLOURS]
-        return found[0] if len(found) == 1 else None
-
-    @cached_property
-    def bearings(self) -> dict[int, float]:
-        """Degrees to the right of the camera's line to a common middle, set by `ordered`."""
-        return {}
+        shaded = bool({"light", "dark"} & set(words))
+        return found[0] if len(found) == 1 and not shaded else None
 
     def ordered(self, rows: Sequence[int]) -> list[int] | None:
         """From left to right, where no two are nearer than 5 degrees and none is far round."""
@@ -514,7 +510,6 @@ class Phrases:
                 continue
             for colour in sorted({one for one in said.values() if one}):
                 meant = frozenset(at for at in rows if said[at] == colour)
-                text = f"the {colour} {kind} that is not on the floor"
                 yield Asked(kind="colour", text=f"the one {colour} {kind}", meant=meant, one=True)
                 others = frozenset(rows) - meant
                 if others:
@@ -538,8 +533,7 @@ def _outcome(asked: Asked, said: Reference, instance: Callable[[int], int]) -> s
     if said.status == asked.expected:
         return "right"
     if said.status == "found":
-        nothing = asked.expected == "nothing" and not said.things
-        return "right" if nothing else "wrong silently"
+        return "wrong silently"
     return {"ambiguous": "ambiguous said", "nothing": "nothing said"}[said.status]
 
 

@@ -49,6 +49,10 @@ _BAND = 0.54
 """Sum of the weights in the band around a foot of a side that goes on above it, over what it has
 in the three times as high band above: the integral of exp(-h^2) from -2 to 1, over 3."""
 
+_FLOATING = 0.5
+"""Share of its height by which an object may float over what it perhaps stands on: thin feet of
+monitors have few Gaussians."""
+
 _LEAST_SUPPORT = 3
 """Centres of a surface below which nothing stands on it."""
 
@@ -270,14 +274,19 @@ class ObjectGeometry:
                 apart = np.maximum(low - self.high[at], self.low[at] - high)
                 if float(np.maximum(apart, 0).max()) <= reach:
                     found[at] = _grade(self.gap(target, at), yes=2 * noise, no=reach)
+                drop = float(low[2] - self.high[at, 2])
+                if 0 <= drop <= _FLOATING * side[2] and self.overlap(target, at) == YES:
+                    found[at] = max(found[at], PERHAPS)  # its foot may be what nobody saw
         return found
 
     def overlap(self, first: int, second: int) -> float:
         """Whether footprints lie over each other."""
         shared = np.minimum(self.high[first], self.high[second])
-        shared = (shared - np.maximum(self.low[first], self.low[second]))[:2].clip(0)
+        shared = shared - np.maximum(self.low[first], self.low[second])
+        # What hangs at a wall is over what stands at it, a surface's noise before it.
+        shared = (shared[:2] + 2 * _NOISE * self.extent).clip(0)
         smaller = np.minimum(self.side[first, :2], self.side[second, :2])
-        share = float((shared / smaller.clip(1e-9)).prod())
+        share = float((shared / smaller.clip(1e-9)).clip(0, 1).prod())
         return _grade(share, yes=_OVERLAP_YES, no=_OVERLAP_PERHAPS)
 
     def inside(self, target: int, landmark: int) -> float:
@@ -374,11 +383,14 @@ class ObjectGeometry:
         return found
 
     def levels(self, landmark: int) -> list[list[int]]:
-        """What stands on a shelf, or in it, by the heights of feet, the lowest first."""
+        """What stands on a shelf, or perhaps does, by the heights of feet, the lowest first."""
         things = [
             at
             for at in range(len(self.points))
-            if at != landmark and len(self.points[at]) and self.on(at, landmark) == YES
+            if at != landmark
+            and len(self.points[at])
+            and self.diagonal[at] < self.diagonal[landmark]
+            and self.on(at, landmark) > NO
         ]
         things.sort(key=lambda at: float(self.low[at, 2]))
         found: list[list[int]] = []

@@ -14,7 +14,7 @@ from splatseg.lift.referring.grammar import NounPhrase, parse_referring
 from splatseg.lift.referring.resolve import NameMatch
 from splatseg.lift.vocabulary import Vocabulary
 
-_PERHAPS_NAMED = 0.1
+_PERHAPS_NAMED = 0.03
 """Probability of a name below which an object has another: in doubt, a phrase is ambiguous."""
 
 

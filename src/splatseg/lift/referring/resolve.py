@@ -33,8 +33,9 @@ from splatseg.lift.referring.grammar import Clause, NounPhrase, Order
 
 Status = Literal["found", "ambiguous", "nothing"]
 
-_COLOUR_YES, _COLOUR_NO = 15.0, 60.0
-"""Delta E to a named colour, lightness halved: mean colours of small things are off by 30."""
+_COLOUR_YES, _COLOUR_NO = 15.0, 75.0
+"""Delta E to a named colour, lightness halved: mean colours of small things are off by 30, and
+of a bowl full of fruit by 67."""
 
 _CONTRAST, _CONTRAST_MOST = 20.0, 45.0
 """Delta E by which the only thing of a colour is nearer to it than all others of its kind."""
@@ -193,12 +194,9 @@ class Resolver:
         referents = [self._referent(meant, at) for at in all_of_them]
         referents.sort(key=lambda one: (-round(one.probability, 2), one.thing))
         if not all_of_them:
-            if phrase.quantity == "count":
-                return Reference(
-                    status="found", referents=(), explanation=f"{text}: 0, {meant.failed}"
-                )
+            count = "0" if phrase.quantity == "count" else "nothing"
             return Reference(
-                status="nothing", referents=(), explanation=f"{text}: nothing, {meant.failed}"
+                status="nothing", referents=(), explanation=f"{text}: {count}, {meant.failed}"
             )
         wanted = phrase.number or (1 if phrase.quantity == "one" else None)
         certain = len(sure) == len(all_of_them)
@@ -317,8 +315,8 @@ class Resolver:
         for landmark in landmarks:
             if landmark.fitting():
                 continue
-            if clause.negated:
-                return  # it is related to nothing of the kind
+            if clause.negated and not any(one.definite for one in clause.landmarks):
+                return  # "not on a desk", where none is; "the desk" should be there
             meant.grades = np.full_like(meant.grades, NO)
             meant.failed = landmark.failed or f"no {landmark.name} is in the scene"
             return
@@ -429,11 +427,19 @@ class Resolver:
         levels = self._geometry.levels(shelf)
         if len(levels) < _LEAST_LEVELS:
             return NO
+        on = self._geometry.on
+        sure = [any(on(at, shelf) == YES for at in one) for one in levels]
         if level.key == "middle":
             chosen = levels[len(levels) // 2] if len(levels) % 2 else []
-        else:
-            chosen = levels[-1] if level.descending else levels[0]
-        return YES if target in chosen else NO
+            return (YES if all(sure) else PERHAPS) if target in chosen else NO
+        for at in reversed(range(len(levels))) if level.descending else range(len(levels)):
+            if sure[at]:
+                # Below it may be one of things that are perhaps on it.
+                first = at == (len(levels) - 1 if level.descending else 0)
+                return (YES if first else PERHAPS) if target in levels[at] else NO
+            if target in levels[at]:
+                return PERHAPS
+        return NO
 
     def _has_levels(self, meant: _Meant) -> bool:
         """Whether upper and lower are levels of a shelf, not several shelves over each other."""
