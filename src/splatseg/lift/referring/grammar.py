@@ -377,12 +377,21 @@ class _Parser:
         """The name in the singular, and whether it is a plural."""
         said = " ".join(noun)
         last, plural = singular(noun[-1])
+        if plural:
+            # Of "cactuses" and "vases" only the names know which end is the plural's.
+            ends = (last, noun[-1][:-1], noun[-1][:-2])
+            known = (end for end in ends if self._is_known_end((*noun[:-1], end)))
+            last = next(known, last)
         one = " ".join((*noun[:-1], last))
         if self._is_name(said) and not (plural and self._is_name(one)):
             return said, False
         if last in _ANYTHING:
             return " ".join(noun[:-1]), plural or last == "everything"
         return one, plural
+
+    def _is_known_end(self, noun: tuple[str, ...]) -> bool:
+        """Whether a noun ends in a name."""
+        return any(self._is_name(" ".join(noun[at:])) for at in range(len(noun)))
 
     # Clauses
 
