@@ -199,7 +199,8 @@ class TrueRoom:
         middle = np.mean([self.mean[at] for at in rows], axis=0) - self.eye
         away = np.arctan2(middle[1], middle[0])
         bearing = {
-            at: (away - np.arctan2(*(self.mean[at] - self.eye)[1::-1]) + np.pi) % (2 * np.pi) - np.pi
+            at: (away - np.arctan2(*(self.mean[at] - self.eye)[1::-1]) + np.pi) % (2 * np.pi)
+            - np.pi
             for at in rows
         }
         if max(abs(one) for one in bearing.values()) > np.radians(65):
@@ -366,8 +367,9 @@ class Phrases:
                     for at in self.room.of(kind)
                 }
                 low = _fitting(held)
-                outer, stood = self._held(kind, landmark, named[said]), self._held(
-                    kind, surface, self.room.on
+                outer, stood = (
+                    self._held(kind, landmark, named[said]),
+                    self._held(kind, surface, self.room.on),
                 )
                 if low is None or "unclear" in (*outer.values(), *stood.values()):
                     continue
@@ -389,9 +391,7 @@ class Phrases:
                 joined: dict[int, Truth] = {}
                 for at in on:
                     pair = (on[at], held[at])
-                    joined[at] = (
-                        "no" if "no" in pair else "unclear" if "unclear" in pair else "yes"
-                    )
+                    joined[at] = "no" if "no" in pair else "unclear" if "unclear" in pair else "yes"
                 meant = _fitting(joined)
                 if meant is not None and len(meant) == 1:
                     text = f"the {kind} on the {first} and {said} the {second}"
@@ -493,9 +493,7 @@ class Phrases:
                     for shelf, _ in level.values()
                 }
                 meant = frozenset(
-                    at
-                    for at in room.of(kind)
-                    if at in level and level[at][1] == ends[level[at][0]]
+                    at for at in room.of(kind) if at in level and level[at][1] == ends[level[at][0]]
                 )
                 several = len(meant) > 1
                 text = f"{_plural(kind) if several else f'the {kind}'} on the {said} shelf"

@@ -245,6 +245,8 @@ class QuerySession:
         self._scene = scene
         self._options = options or QueryOptions()
         work = Work(scene=scene, layers=layers, backend=backend, observer=observer)
+        if self._options.view is not None:
+            scene.view(self._options.view)  # a name that is none is told before anything is read
         self._source = word_source(work, self._options, encoder=encoder, words=words)
         if len(self._source.features) != len(scene.gaussians):
             raise InputError(

@@ -154,7 +154,8 @@ class QueryOptions:
     that relate, order, count or negate are resolved among the objects. whole: the cosine alone."""
 
     view: str | None = None
-    """View from which left, right, in front and behind are said. None takes the first train view."""
+    """View from which left, right, in front and behind are said. None takes the first of
+    training."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

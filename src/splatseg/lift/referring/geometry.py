@@ -16,6 +16,7 @@ References:
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float, Int64
@@ -149,12 +150,12 @@ class ObjectGeometry:
     @cached_property
     def low(self) -> Array:
         """Lower corners of boxes (k, 3); NaN of those nowhere."""
-        return _corners(self.points, np.min)
+        return _corners(self.points, 0.0)
 
     @cached_property
     def high(self) -> Array:
         """Upper corners of boxes (k, 3)."""
-        return _corners(self.points, np.max)
+        return _corners(self.points, 1.0)
 
     @property
     def centre(self) -> Array:
@@ -200,8 +201,8 @@ class ObjectGeometry:
         return self._gaps[key]
 
     def gaps(self, rows: Sequence[int], landmark: int) -> Array:
-        """`gap` of several objects to one."""
-        return np.array([self.gap(row, landmark) if row != landmark else 0.0 for row in rows])
+        """`gap` of several objects to one; infinite of itself."""
+        return np.array([self.gap(row, landmark) if row != landmark else np.inf for row in rows])
 
     # Relations that every viewer sees alike
 
@@ -407,11 +408,11 @@ def _grade(value: float, *, yes: float, no: float) -> float:
     return float(graded(np.float64(value), yes=yes, no=no))
 
 
-def _corners(points: Sequence[Array], of: "np.ufunc | object") -> Array:
+def _corners(points: Sequence[Array], share: float) -> Array:
     found = np.full((len(points), 3), np.nan)
     for at, one in enumerate(points):
         if len(one):
-            found[at] = of(one, axis=0)  # pyright: ignore
+            found[at] = np.quantile(one, share, axis=0)
     return found
 
 
@@ -430,7 +431,7 @@ def object_geometry(
     order = np.argsort(ids, kind="stable")
     ends = np.searchsorted(ids[order], np.arange(int(ids.max(initial=-1)) + 2))
     points: list[Array] = []
-    for start, end in zip(ends[:-1], ends[1:], strict=True):
+    for start, end in pairwise(ends.tolist()):
         own = means[order[start:end]]
         if len(own):
             low, high = np.quantile(own, _TRIMMED, axis=0)

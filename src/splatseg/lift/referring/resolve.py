@@ -27,9 +27,9 @@ from splatseg.lift.referring.geometry import (
     Array,
     ObjectGeometry,
     Viewer,
-    views_towards,
 )
 from splatseg.lift.referring.grammar import Clause, NounPhrase, Order
+from splatseg.lift.referring.orders import ranked_grades, ranking
 
 Status = Literal["found", "ambiguous", "nothing"]
 
@@ -39,21 +39,6 @@ of a bowl full of fruit by 67."""
 
 _CONTRAST, _CONTRAST_MOST = 20.0, 45.0
 """Delta E by which the only thing of a colour is nearer to it than all others of its kind."""
-
-_MARGIN = 1.12
-"""Ratio by which the largest, tallest or nearest must be more so than the next."""
-
-_STANDS_OUT = 1.4
-"""The same of "large" and "small"."""
-
-_HEIGHT_MARGIN = 0.3
-"""Share of the smaller height by which the highest is above the next."""
-
-_ANGLE_MARGIN = 0.03
-"""Radians between neighbours from left to right: 2 degrees."""
-
-_HALF_TURN = 1.4
-"""Radians to either side beyond which things are around the viewer, and none is leftmost."""
 
 _LEAST_LEVELS = 2
 """Heights at which a shelf holds things, from which on it has an upper and a lower one."""
@@ -215,7 +200,9 @@ class Resolver:
                 + _listed(referents),
             )
         doubtful = "" if certain else ", some of them uncertain"
-        count = "1 candidate" if len(referents) == 1 else f"{len(referents)} candidates"
+        count = f"{len(referents)} candidates"
+        if len(referents) == 1:
+            count, doubtful = "1 candidate", ", which is uncertain"
         return Reference(
             status="ambiguous",
             referents=tuple(referents),
@@ -404,12 +391,7 @@ class Resolver:
             return grade if level is None else min(grade, self._on_level(level, target, landmark))
         if relation == "with":
             turned = Clause(words=clause.words, relation=clause.within, landmarks=clause.landmarks)
-            if clause.within in _VIEW_RELATIONS:
-                raise InputError(
-                    f"words: expected on, in, under, above or near it, got {clause.within!r}."
-                )
-            held = self._plain(turned, landmark, target)
-            return held
+            return self._plain(turned, landmark, target)
         if relation == "between":
             return geometry.between(target, landmarks[0], landmarks[1])
         return self._plain(clause, target, landmark)
@@ -462,133 +444,27 @@ class Resolver:
                 f"words: expected a side to count from after {order.words!r}, such as 'from the "
                 "left', or a size, such as 'second largest', got none."
             )
-        ranked, said, tie = self._values(meant, order, rows)
-        grades = np.full(len(meant.grades), NO)
-        if ranked is None:
-            for at in rows:
-                grades[at] = PERHAPS
-                meant.because(at, said)
-        else:
-            self._picked(meant, order, count, rows, ranked, grades, tie)
-            for at in np.flatnonzero(grades):
-                meant.because(int(at), said)
-        self._join(meant, grades, f"there are not so many of {meant.name}")
-
-    def _picked(
-        self,
-        meant: _Meant,
-        order: Order,
-        count: int,
-        rows: list[int],
-        values: Array,
-        grades: Array,
-        apart: Callable[[int, int], bool],
-    ) -> None:
-        """Grade what has the rank, by all that are sure and by all that are perhaps."""
-        sequence = sorted(
-            range(len(rows)), key=lambda i: -values[i] if order.descending else values[i]
-        )
-        start = order.rank - 1
-        if order.key == "middle":
-            if len(rows) % 2 == 0:
+        landmark = None
+        if order.landmark is not None:
+            landmark = self._meant(order.landmark)
+            if not landmark.fitting():
+                meant.grades = np.full_like(meant.grades, NO)
+                meant.failed = landmark.failed
                 return
-            start, count = len(rows) // 2, 1
-        chosen = sequence[start : start + count]
-        if len(chosen) < count:
-            return
-        before, after = sequence[:start], sequence[start + count :]
-        doubtful = [i for i in sequence if meant.grades[rows[i]] < YES]
-        tied = [i for i in (*before, *after) if any(not apart(i, j) for j in chosen)]
-        # One that is perhaps among them moves the rank of all after it.
-        moved = bool(set(doubtful) & {*before, *chosen}) or bool(tied)
-        if order.key == "middle":
-            moved = moved or bool(doubtful)
-        for i in chosen:
-            grades[rows[i]] = PERHAPS if moved else YES
-        others = {*tied, *after[:count]} if set(doubtful) & {*before, *chosen} else set(tied)
-        for i in others:
-            grades[rows[i]] = PERHAPS
-
-    def _values(
-        self, meant: _Meant, order: Order, rows: list[int]
-    ) -> tuple[Array | None, str, Callable[[int, int], bool]]:
-        """What is compared, the reason, and whether two are clearly apart; None: incomparable."""
-        geometry, said = self._geometry, order.words
-        ratio = _STANDS_OUT if order.stands_out else _MARGIN
-        among = f"{said} of {len(rows)}"
-
-        def by_ratio(values: Array, least: float) -> Callable[[int, int], bool]:
-            def apart(i: int, j: int) -> bool:
-                small, large = sorted((float(values[i]), float(values[j])))
-                return large > ratio * small + least
-
-            return apart
-
-        if order.key == "size":
-            values = geometry.diagonal[rows]
-            return values, among, by_ratio(values, 0.0)
-        if order.key == "distance" and order.landmark is not None:
-            return self._distances(order, rows, ratio)
-        if order.key in ("height", "elevation") and not geometry.has_up:
-            raise InputError(f"words: {said!r} needs to know where up is, the scene does not say.")
-        if order.key == "height":
-            values = geometry.side[rows, 2]
-            return values, among, by_ratio(values, 0.0)
-        if order.key == "elevation":
-            values, heights = geometry.centre[rows, 2], geometry.side[rows, 2]
-            return (
-                values,
-                among,
-                lambda i, j: bool(
-                    abs(values[i] - values[j]) > _HEIGHT_MARGIN * min(heights[i], heights[j])
-                ),
-            )
-        viewer = self._seen_by(said)
-        among = f"{among} from view {viewer.name}"
-        if order.key == "depth":
-            values = np.linalg.norm(geometry.centre[rows] - viewer.eye, axis=1)
-            return values, among, by_ratio(values, 0.0)
-        values = views_towards(viewer, geometry.centre[rows])
-        if float(np.abs(values).max()) > _HALF_TURN:
-            around = f"perhaps {said}: they are on all sides of view {viewer.name}"
-            return None, around, lambda i, j: False
-        return values, among, lambda i, j: bool(abs(values[i] - values[j]) > _ANGLE_MARGIN)
-
-    def _distances(
-        self, order: Order, rows: list[int], ratio: float
-    ) -> tuple[Array | None, str, Callable[[int, int], bool]]:
-        """Distances from a landmark, between surfaces; that of centres must agree."""
-        geometry = self._geometry
-        landmark = self._meant(order.landmark) if order.landmark is not None else None
-        fitting = landmark.fitting() if landmark is not None else []
-        if landmark is None or not fitting:
-            name = "" if landmark is None else landmark.name
-            return None, f"perhaps: no {name} is in the scene", lambda i, j: False
-        gaps = np.array([geometry.gaps(rows, at) for at in fitting])
-        first = np.array([self._first(one, order, ratio) for one in gaps])
-        which = f"{landmark.name} {fitting[0]}"
-        if len(fitting) > 1:
-            if len({int(one) for one in first}) > 1 or -1 in first:
-                kinds = f"{len(fitting)} of {landmark.name}"
-                return None, f"perhaps {order.words} one of {kinds}", lambda i, j: False
-            which = f"any of {len(fitting)} of {landmark.name}"
-        values = gaps[0]
-        if len(fitting) == 1 and landmark.grades[fitting[0]] < YES:
-            return None, f"perhaps {order.words} {which}", lambda i, j: False
-        least = _HEIGHT_MARGIN * 0.1 * float(geometry.diagonal[rows].mean())
-
-        def apart(i: int, j: int) -> bool:
-            small, large = sorted((float(values[i]), float(values[j])))
-            return large > ratio * small + least
-
-        return values, f"{order.words} {which}", apart
-
-    def _first(self, gaps: Array, order: Order, ratio: float) -> int:
-        """Which of several has the rank by one landmark; -1 where the next is as near."""
-        sequence = np.argsort(-gaps if order.descending else gaps, kind="stable")
-        if len(sequence) < order.rank:
-            return -1
-        return int(sequence[order.rank - 1])
+        ranked = ranking(
+            self._geometry,
+            order,
+            rows,
+            viewer=self._seen_by,
+            landmarks=() if landmark is None else landmark.fitting(),
+            landmark="" if landmark is None else landmark.name,
+            certain=landmark is None or bool(landmark.fitting(YES)),
+        )
+        grades = np.full(len(meant.grades), NO)
+        grades[rows] = ranked_grades(ranked, order, count, meant.grades[rows])
+        for at in np.flatnonzero(grades):
+            meant.because(int(at), ranked.reason)
+        self._join(meant, grades, f"no {meant.name} is {order.words}")
 
 
 def _level_of_order(order: Order) -> bool:
