@@ -27,7 +27,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scored import run_rows
 from word_scene import WordScene
 
@@ -115,7 +115,7 @@ class TrueRoom:
         self.long = {at: float(np.linalg.norm(self.high[at] - self.low[at])) for at in self.points}
         camera = bench.scene.train_views[0].camera
         self.eye = camera.centre.double().numpy()
-        self._trees = {at: cKDTree(points) for at, points in self.points.items()}
+        self._trees = {at: KDTree(points) for at, points in self.points.items()}
         self._apart: dict[tuple[int, int], float] = {}
 
     def of(self, kind: str) -> list[int]:
@@ -232,7 +232,7 @@ def _any(truths: Sequence[Truth]) -> Truth:
 
 
 def _not(truth: Truth) -> Truth:
-    return {"yes": "no", "no": "yes", "unclear": "unclear"}[truth]  # type: ignore[return-value]
+    return "no" if truth == "yes" else "yes" if truth == "no" else "unclear"
 
 
 def _plural(name: str) -> str:

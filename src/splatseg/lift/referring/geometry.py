@@ -21,7 +21,7 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float, Int64
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from splatseg.core import Gaussians
@@ -186,7 +186,7 @@ class ObjectGeometry:
         return [one[:: max(len(one) // _POINTS, 1)] for one in self.points]
 
     @cached_property
-    def _trees(self) -> dict[int, cKDTree]:
+    def _trees(self) -> dict[int, KDTree]:
         return {}
 
     def gap(self, first: int, second: int) -> float:
@@ -195,7 +195,7 @@ class ObjectGeometry:
         if key not in self._gaps:
             small, large = sorted(key, key=lambda one: len(self.points[one]))
             if large not in self._trees:
-                self._trees[large] = cKDTree(self.points[large])
+                self._trees[large] = KDTree(self.points[large])
             found = self._trees[large].query(self._sampled[small])[0]
             self._gaps[key] = float(found.min())
         return self._gaps[key]
@@ -405,7 +405,7 @@ class ObjectGeometry:
 
 
 def _grade(value: float, *, yes: float, no: float) -> float:
-    return float(graded(np.float64(value), yes=yes, no=no))
+    return float(graded(np.asarray(value, np.float64), yes=yes, no=no))
 
 
 def _corners(points: Sequence[Array], share: float) -> Array:

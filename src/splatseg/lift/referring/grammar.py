@@ -94,7 +94,8 @@ _EXCEPT = ("except for", "except", "other than", "apart from", "but not")
 _PLURALS = {
     "shelves": "shelf", "bookshelves": "bookshelf", "knives": "knife", "mice": "mouse",
     "dice": "die", "people": "person", "men": "man", "women": "woman", "children": "child",
-    "feet": "foot", "leaves": "leaf", "loaves": "loaf", "cacti": "cactus", "ones": "one",
+    "feet": "foot", "leaves": "leaf", "loaves": "loaf", "cacti": "cactus", "cactuses": "cactus",
+    "buses": "bus", "ones": "one",
 }  # fmt: skip
 _NO_PLURALS = (
     "glasses", "scissors", "headphones", "blinds", "stairs", "pants", "trousers", "jeans",
@@ -110,6 +111,9 @@ _KEYWORDS = frozenset(
     for word in phrase.split()[:1]
 )  # fmt: skip
 """Words that end a name."""
+
+_TWO = 2
+"""Things that something is between."""
 
 _MAX_RELATIONS = 5
 """More give so many readings that nobody means one of them."""
@@ -271,8 +275,6 @@ class _Parser:
                 return
         yield from self._noun_phrase(0)
 
-    # Words
-
     def _word(self, at: int) -> str:
         self.furthest = max(self.furthest, min(at, len(self._words)))
         return self._words[at] if at < len(self._words) else ""
@@ -288,17 +290,13 @@ class _Parser:
         return max((end for end in ends if end is not None), default=None)
 
     def _relation(self, at: int) -> tuple[Relation, str, int] | None:
-        end = self._one_of(at, tuple(_RELATIONS))
-        if end is None:
+        if (end := self._one_of(at, tuple(_RELATIONS))) is None:
             return None
         said = " ".join(self._words[at:end])
         return _RELATIONS[said], said, end
 
-    # Noun phrases
-
     def _noun_phrase(self, at: int) -> Iterator[tuple[NounPhrase, int]]:
-        core = self._core(at)
-        if core is not None:
+        if (core := self._core(at)) is not None:
             yield from self._with_clauses(*core)
 
     def _core(self, at: int) -> tuple[NounPhrase, int] | None:
@@ -308,10 +306,9 @@ class _Parser:
         clauses: list[Clause] = []
         if self._word(at) in _ARTICLES:
             definite, at = self._word(at) == "the", at + 1
-        both = self._after(at, "both")
-        if both is not None:
-            number, at = 2, self._after(both, "the") or both
-        while not self._is_rest_a_name(at):
+        if (both := self._after(at, "both")) is not None:
+            number, at = _TWO, self._after(both, "the") or both
+        while not self._is_name(" ".join(self._name(at))):  # "top hat"
             word = self._word(at)
             if word in ("not", "non") and self._word(at + 1):
                 size = 2 if self._word(at + 1) in ("light", "dark", "pale") else 1
@@ -349,21 +346,17 @@ class _Parser:
         if len(orders) > 1:
             return None
         called, plural = self._called(noun)
-        plural = plural and not among
+        plural = (plural and not among) or (number or 1) > 1
         made = NounPhrase(
             noun=called,
-            plural=plural or (number or 1) > 1,
-            quantity="all" if plural or (number or 1) > 1 else "one",
+            plural=plural,
+            quantity="all" if plural else "one",
             number=number,
             orders=tuple(orders),
             clauses=tuple(clauses),
             definite=definite,
         )
         return made, at
-
-    def _is_rest_a_name(self, at: int) -> bool:
-        """Whether the words up to the next keyword are a name as they stand: "top hat"."""
-        return self._is_name(" ".join(self._name(at)))
 
     def _name(self, at: int) -> tuple[str, ...]:
         """Words up to the next that ends a name."""
@@ -393,8 +386,6 @@ class _Parser:
         """Whether a noun ends in a name."""
         return any(self._is_name(" ".join(noun[at:])) for at in range(len(noun)))
 
-    # Clauses
-
     def _with_clauses(self, phrase: NounPhrase, at: int) -> Iterator[tuple[NounPhrase, int]]:
         """The phrase with as many of the clauses that follow as it takes, the most first."""
         for clause, end in self._clause(at, bool(phrase.clauses)):
@@ -408,9 +399,7 @@ class _Parser:
         yield phrase, at
 
     def _clause(self, at: int, has_clause: bool) -> Iterator[tuple[Clause | Order, int]]:
-        start = at
-        excepted = self._one_of(at, _EXCEPT)
-        if excepted is not None:
+        if (excepted := self._one_of(at, _EXCEPT)) is not None:
             said = " ".join(self._words[at:excepted])
             for landmark, end in self._noun_phrase(excepted):
                 yield Clause(words=said, landmarks=(landmark,), negated=True), end
@@ -435,13 +424,11 @@ class _Parser:
             relation, said, end = found
             yield from self._related(relation, said, end, negated=negated)
         elif (copula or negated) and at > linked:
-            colour = self._name(at)
-            if colour and (at > start):
+            colour = " ".join(self._name(at))
+            if colour:
                 said = "not" if negated else "is"
-                yield (
-                    Clause(words=said, attribute=" ".join(colour), negated=negated),
-                    at + len(colour),
-                )
+                clause = Clause(words=said, attribute=colour, negated=negated)
+                yield clause, at + len(colour.split())
 
     def _related(
         self, relation: Relation, said: str, at: int, *, negated: bool
@@ -454,15 +441,14 @@ class _Parser:
                     yield replace(clause, within=place[0]), place[2] + 1
                     continue
                 yield clause, end
-            elif (
-                relation != "between"
-                or landmark.number == 2
-                or (landmark.plural and landmark.number is None)
-            ):
+            elif relation == "between":
+                if landmark.number == _TWO or (landmark.plural and landmark.number is None):
+                    yield clause, end
+                if self._word(end) == "and":
+                    for second, stop in self._noun_phrase(end + 1):
+                        yield replace(clause, landmarks=(landmark, second)), stop
+            elif (landmark.number or 1) == 1:  # "near two chairs" says more than near a chair
                 yield clause, end
-            if relation == "between" and self._word(end) == "and":
-                for second, stop in self._noun_phrase(end + 1):
-                    yield replace(clause, landmarks=(landmark, second)), stop
 
     def _order_after(self, at: int, negated: bool) -> Iterator[tuple[Order, int]]:
         """Orders that follow the noun: "nearest the window", "from the left", "on the left"."""
@@ -474,23 +460,18 @@ class _Parser:
             end = end or at + 1 + (self._word(at + 1) in ("to", "from"))
             descending = word in ("farthest", "furthest")
             for landmark, stop in self._noun_phrase(end):
-                yield (
-                    Order(words=word, key="distance", descending=descending, landmark=landmark),
-                    stop,
-                )
+                order = Order(words=word, key="distance", descending=descending, landmark=landmark)
+                yield order, stop
         if word in ("to", "from"):
             # "the nearest chair to the window": completed by what stood before the noun.
             for landmark, stop in self._noun_phrase(at + 1):
                 yield Order(words="", key="distance", landmark=landmark), stop
         if word in ("from", "on", "at", "in", "to") and self._word(at + 1) == "the":
             side = self._word(at + 2)
-            ends_here = self._word(at + 3) not in ("of", "side") and not self._starts_name(at + 3)
+            ends_here = self._word(at + 3) not in ("of", "side") and not self._name(at + 3)
             if side in _POSITIONS and ends_here:
                 key, descending = _POSITIONS[side]
                 yield Order(words=f"{word} the {side}", key=key, descending=descending), at + 3
-
-    def _starts_name(self, at: int) -> bool:
-        return bool(self._name(at))
 
 
 def _ordinal(rank: int) -> str:
@@ -503,22 +484,14 @@ def _ordered(phrase: NounPhrase, order: Order) -> NounPhrase | None:
     waiting = before is not None and before.rank < 0
     if order.words == "":
         # "to" and "from" complete "nearest" and "farthest" only.
-        if before is None or before.key != "depth" or before.landmark is not None:
+        if before is None or before.key != "depth" or before.words.split()[-1] not in _ORDERS:
             return None
-        if before.words.split()[-1] not in _ORDERS:
-            return None
-        joined = replace(before, key="distance", landmark=order.landmark)
-        return replace(phrase, orders=(*phrase.orders[:-1], joined))
-    if order.words.startswith("from"):
+        return replace(phrase, orders=(replace(before, key="distance", landmark=order.landmark),))
+    counts = order.words.startswith("from")
+    if before is None:
         # "second from the left" counts; "from the left" alone says nothing.
-        if not waiting or before is None or order.key == "middle":
-            return None
-        said = f"{before.words} {order.words}"
-        joined = replace(order, words=said, rank=-before.rank)
-        return replace(phrase, orders=(*phrase.orders[:-1], joined))
-    if waiting and before is not None:
-        if order.key != "distance":
-            return None
-        joined = replace(order, words=f"{before.words} {order.words}", rank=-before.rank)
-        return replace(phrase, orders=(*phrase.orders[:-1], joined))
-    return None if phrase.orders else replace(phrase, orders=(order,))
+        return None if counts else replace(phrase, orders=(order,))
+    if not waiting or order.key == "middle" or not (counts or order.key == "distance"):
+        return None
+    joined = replace(order, words=f"{before.words} {order.words}", rank=-before.rank)
+    return replace(phrase, orders=(joined,))
