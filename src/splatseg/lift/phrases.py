@@ -15,7 +15,7 @@ others are as sure as they come near it:
 .. math:: p_k = \max(p_b(\text{phrase}), p_b(\text{name})) \, e^{s_k - s_b}, \qquad b = \arg\max s
 
 Parts that a phrase does not have, or that nothing is known of, do not count: "mug" is what it was.
-Left, right, before and behind depend on who looks, and are not read.
+Left, right, before and behind depend on who looks; `lift.referring` reads them.
 
 References:
     CIE 15:2004, the colour space CIELAB and its distance of 1976.
