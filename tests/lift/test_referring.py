@@ -138,6 +138,35 @@ def test_what_floats_just_above_is_perhaps_on_it() -> None:
         assert geometry_of([desk, monitor, far]).on(1, 0) == grade
 
 
+@pytest.mark.parametrize(
+    ("step", "sparse"), [(0.05, YES), (0.06, PERHAPS), (0.1, PERHAPS), (0.16, NO)]
+)
+def test_a_support_has_its_share_of_the_surface(step, sparse) -> None:
+    """Between two tables, one with fewer Gaussians: a half, 0.4, 0.2 and 0.1 of all."""
+    tables = [box((-2, -1, 0.7), (0, 1, 0.7), 0.05), box((0, -1, 0.7), (2, 1, 0.7), step)]
+    room = geometry_of([*tables, box((-0.2, -0.2, 0.71), (0.2, 0.2, 1.2))])
+    assert room.on(2, 0) == YES
+    assert room.on(2, 1) == sparse
+
+
+@pytest.mark.parametrize(("sunk", "grade"), [(0.0, YES), (0.14, YES), (0.2, NO)])
+def test_how_far_a_foot_may_be_off(sunk, grade) -> None:
+    """A statue of 1 on a pedestal that is smaller than it: 0.15, and the noise, 0.02."""
+    pedestal, far = box((0, 0, 0.5), (0.5, 0.5, 0.55)), box((3, 3, 0), (3.1, 3.1, 0.1))
+    statue = box((0.05, 0.05, 0.55 - sunk), (0.45, 0.45, 1.55 - sunk))
+    assert geometry_of([pedestal, statue, far]).on(1, 0) == grade
+
+
+@pytest.mark.parametrize(("gap", "grade"), [(1.8, YES), (2.6, PERHAPS), (3.8, PERHAPS), (4.5, NO)])
+def test_how_far_from_a_wall_a_picture_hangs(gap, grade) -> None:
+    """In thousandths of the extent, the noise of a surface being four."""
+    wall, far = box((0, 0, 0), (4, 0, 2.5), 0.02), box((0, 5, 0), (0.2, 5.2, 0.2))
+    extent = geometry_of([wall, far]).extent
+    away = gap * 0.004 * extent
+    picture = box((1, away, 1.2), (1.6, away + 0.02, 1.7))
+    assert geometry_of([wall, picture, far]).on(1, 0) == grade
+
+
 def test_what_stands_on_no_object_may_stand_on_the_rest() -> None:
     rest = box((-3, -3, -0.05), (5, 5, 0), 0.1)
     desk = box((0, 0, 0.7), (1.6, 0.8, 0.75))

@@ -5,18 +5,8 @@ import pytest
 from splatseg.errors import InputError
 from splatseg.lift.referring.grammar import NounPhrase, parse_referring, singular
 
-NAMES = {
-    "mug",
-    "book",
-    "books",
-    "desk",
-    "office chair",
-    "chair",
-    "cactus",
-    "vase",
-    "top hat",
-    "box",
-}
+NAMES = {"mug", "book", "books", "desk", "office chair", "chair", "cactus", "vase", "top hat", "box",
+         "stand"}  # fmt: skip
 
 
 def shown(phrase: NounPhrase) -> str:
@@ -52,6 +42,11 @@ def shown(phrase: NounPhrase) -> str:
         ("glasses", ["[glasses]"]),
         ("vases", ["[vase*]"]),
         ("boxes", ["[box*]"]),
+        ("box standing on the stand", ["[box](on [stand])"]),
+        (
+            "the stand left of the box that stands on the desk",
+            ["[stand](left of [box](on [desk]))", "[stand](left of [box])(on [desk])"],
+        ),
         ("three cactuses", ["3 [cactus*]"]),
         ("white mug on the desk (2)", ["[white mug](on [desk])"]),
         # Relations

@@ -359,8 +359,8 @@ class _Parser:
         return made, at
 
     def _name(self, at: int) -> tuple[str, ...]:
-        """Words up to the next that ends a name."""
-        end = at
+        """Words up to the next that ends a name; the first may be one itself: "the stand"."""
+        end = at + self._is_name(self._word(at))
         while end < len(self._words) and self._words[end] not in (*_KEYWORDS, ","):
             end += 1
         self._word(end)
