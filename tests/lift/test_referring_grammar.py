@@ -5,8 +5,8 @@ import pytest
 from splatseg.errors import InputError
 from splatseg.lift.referring.grammar import NounPhrase, parse_referring, singular
 
-NAMES = {"mug", "book", "books", "desk", "office chair", "chair", "cactus", "vase", "top hat", "box",
-         "stand"}  # fmt: skip
+NAMES = {"mug", "book", "books", "desk", "office chair", "chair", "cactus", "vase", "top hat",
+         "box", "stand"}  # fmt: skip
 
 
 def shown(phrase: NounPhrase) -> str:

@@ -40,6 +40,9 @@ of a bowl full of fruit by 67."""
 _CONTRAST, _CONTRAST_MOST = 20.0, 45.0
 """Delta E by which the only thing of a colour is nearer to it than all others of its kind."""
 
+_WEAK = 0.1
+"""Probability of a name below which an object is no rival of the only one that surely has it."""
+
 _LEAST_LEVELS = 2
 """Heights at which a shelf holds things, from which on it has an upper and a lower one."""
 
@@ -109,6 +112,9 @@ class _Meant:
     grades: Array
     probabilities: Array
     reasons: dict[int, list[str]] = field(default_factory=dict[int, list[str]])
+    doubtful: frozenset[int] = frozenset()
+    """Objects that perhaps have the name."""
+
     failed: str = ""
     """Of what emptied it."""
 
@@ -176,6 +182,10 @@ class Resolver:
         """What one reading means."""
         meant = self._meant(phrase)
         sure, all_of_them = meant.fitting(YES), meant.fitting()
+        if phrase.quantity == "one" and len(sure) == 1:
+            # It speaks of one: what hardly has the name is not another.
+            probable = meant.probabilities >= _WEAK
+            all_of_them = [at for at in all_of_them if probable[at] or at in sure]
         referents = [self._referent(meant, at) for at in all_of_them]
         referents.sort(key=lambda one: (-round(one.probability, 2), one.thing))
         if not all_of_them:
@@ -211,7 +221,7 @@ class Resolver:
 
     def _referent(self, meant: _Meant, at: int) -> Referent:
         reasons = ", ".join(meant.reasons.get(at, ()))
-        label = f"{meant.name} {at}"
+        label = f"{'perhaps ' if at in meant.doubtful else ''}{meant.name} {at}"
         return Referent(
             thing=at,
             probability=round(float(meant.probabilities[at]), 6),
@@ -239,7 +249,12 @@ class Resolver:
     def _named(self, phrase: NounPhrase) -> _Meant:
         found = self._match(phrase.noun)
         grades = np.where(self._there, found.grades, NO)
-        meant = _Meant(name=found.name, grades=grades, probabilities=found.probabilities)
+        meant = _Meant(
+            name=found.name,
+            grades=grades,
+            probabilities=found.probabilities,
+            doubtful=frozenset(np.flatnonzero(grades == PERHAPS).tolist()),
+        )
         if not meant.fitting():
             meant.failed = f"no {found.name} is in the scene"
         if found.unread and meant.fitting():
