@@ -173,6 +173,52 @@ def test_what_is_in_a_box_reaches_out_of_it_little(inside, grade) -> None:
     assert geometry_of([tray, thing, far]).inside(1, 0) == grade
 
 
+@pytest.mark.parametrize(
+    ("kept", "grade"), [(100, YES), (45, YES), (25, PERHAPS), (17, PERHAPS), (10, NO)]
+)
+def test_a_shelf_goes_on_at_the_heights_of_what_it_holds(kept, grade) -> None:
+    """Of 100 points a layer so many are left there: 1, 0.51, 0.29, 0.2 and 0.12 of even."""
+    side = np.linspace(0, 1, 100)
+    layers = [
+        np.stack([side, side * 0, side * 0 + z], axis=1)[: kept if 0.4 <= z <= 0.6 else 100]
+        for z in np.linspace(0, 1, 101)
+    ]
+    room = geometry_of(
+        [
+            np.concatenate([*layers, box((0, 0, 0), (1, 0.4, 0))]),
+            box((0.1, 0.1, 0.4), (0.3, 0.3, 0.6)),
+            box((9, 9, 0), (9.5, 9.5, 1)),
+        ]
+    )
+    assert room.inside(1, 0) == grade
+
+
+@pytest.mark.parametrize(("away", "grade"), [(0.0, NO), (2.5, NO), (9.0, YES)])
+def test_walls_of_a_room_hold_nothing(away, grade) -> None:
+    """A box of 4 as the whole scene, as 0.7 of it, and as 0.4 of it."""
+    sides = [box((x, 0, 0), (x, 4, 4), 0.2) for x in (0, 4)]
+    room = geometry_of(
+        [np.concatenate(sides), box((1, 1, 1), (1.5, 1.5, 1.5)), at(2 + away, 2 + away, 2 + away)]
+    )
+    assert room.inside(1, 0) == grade
+
+
+@pytest.mark.parametrize(
+    ("above", "grade"), [(70, YES), (50, PERHAPS), (35, PERHAPS), (25, NO), (0, NO)]
+)
+def test_under_a_table_most_of_it_is_above(above, grade) -> None:
+    """So many of a hundred points of the table over a box are above it, the others beside."""
+    across = np.linspace(0.25, 0.45, 100)
+    heights = np.where(np.arange(100) < above, 0.7, 0.2)
+    column = np.stack([across, across, heights], axis=1)
+    top = box((0, 0, 0.7), (1, 1, 0.7), 0.03)
+    top = top[(top[:, 0] > 0.5) | (top[:, 1] > 0.5)]
+    table = np.concatenate([column, top, np.zeros((1, 3))])
+    floor = box((-1, -1, -0.05), (2, 2, 0))
+    room = geometry_of([table, box((0.2, 0.2, 0.01), (0.5, 0.5, 0.4)), floor])
+    assert room.under(1, 0) == grade
+
+
 @pytest.mark.parametrize(("sunk", "grade"), [(0.0, YES), (0.14, YES), (0.2, NO)])
 def test_how_far_a_foot_may_be_off(sunk, grade) -> None:
     """A statue of 1 on a pedestal that is smaller than it: 0.15, and the noise, 0.02."""
