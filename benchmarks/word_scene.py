@@ -75,6 +75,11 @@ class WordScene(ScoredScene):
         )
         return QuerySession(self.scene, options=options, layers={"asked": layer})
 
+    def asking(self, layer: Features) -> QuerySession:
+        """To be asked which things answer, as `splatseg query` does."""
+        options = QueryOptions(from_layer="asked", features="features_text")
+        return QuerySession(self.scene, options=options, layers={"asked": layer})
+
     def instances(self, index: WordIndex | VoxelWords) -> list[int]:
         """The true instance that most pixels of each thing show, in every fourth train view."""
         if isinstance(index, VoxelWords):

@@ -326,3 +326,123 @@ def test_twice_the_same_word_is_refused(scene, layers, words) -> None:
         QueryOptions(min_probability=1.5)
     with pytest.raises(RangeError, match="components"):
         QueryOptions(components=0)
+
+
+def twins(scene, vocabulary, words) -> Features:
+    """As `layer_of`, but the left third is two things of one word."""
+    layer = layer_of(scene, vocabulary, words)
+    place = scene.gaussians.means[:, 0].argsort().argsort() * 6 // len(scene.gaussians)
+    nudged = torch.where((place == 0)[:, None], layer.values * (1 + 1e-6), layer.values)
+    return replace(layer, values=nudged)
+
+
+def test_phrases_that_refer_among_words(scene, layers, words) -> None:
+    """They get columns of their own; those of words stay as they are, to the bit."""
+    first, second, _ = words
+    phrases = (f"how many {first}s", f"the {first} nearest the {second}", f"two {first}s")
+    plain = query(scene, words, options=LOW, layers=layers)
+    found = query(scene, (phrases[0], *words, *phrases[1:]), options=LOW, layers=layers)
+    assert torch.equal(found.vectors.cosines[:, 1:4], plain.vectors.cosines)
+    assert torch.equal(found.vectors.probabilities[:, 1:4], plain.vectors.probabilities)
+    assert torch.equal(found.things[:, 1:4], plain.things)
+    assert not plain.references
+    assert {word: one.status for word, one in found.references.items()} == dict(
+        zip(phrases, ("found", "found", "nothing"), strict=True)
+    )
+    thing = found.found[first][0]
+    assert found.found[phrases[1]][0].thing == thing.thing
+    assert found.found[phrases[1]][0].probability == thing.probability
+    assert found.unknown == (words[2], phrases[2])
+    assert "expected 2, found 1" in found.references[phrases[2]].explanation
+    one = query(scene, phrases[1:2], options=LOW, layers=layers)
+    assert torch.equal(one.selection().mask, found.of_thing(first, thing.thing).mask)
+    assert one.selection().info.details["references"][phrases[1]]["status"] == "found"
+    # Also where everything is as likely as is asked for.
+    all_of_it = query(scene, phrases[:1], options=QueryOptions(min_probability=0.0), layers=layers)
+    assert len(all_of_it.found[phrases[0]]) == len(all_of_it.references[phrases[0]].things)
+
+
+def test_the_view_decides_what_is_left(scene, layers, words) -> None:
+    """Of two opposite cameras one sees the first word left of the second."""
+    phrases = [f"the {words[0]} {side} of the {words[1]}" for side in ("left", "right")]
+    said = set()
+    for view in scene.train_views:
+        found = query(scene, phrases, options=replace(LOW, view=view.name), layers=layers)
+        left, right = (found.references[phrase] for phrase in phrases)
+        assert "nothing" in (left.status, right.status)
+        assert any(f"from view {view.name}" in one.explanation for one in (left, right))
+        said.add((left.status, right.status))
+    assert len(said) > 1
+    default = query(scene, phrases, options=LOW, layers=layers)
+    assert any(
+        f"from view {scene.train_views[0].name}" in one.explanation
+        for one in default.references.values()
+    )
+    with pytest.raises(InputError, match="there is no 'nothing' among"):
+        query(scene, words, options=replace(LOW, view="nothing"), layers=layers)
+
+
+def test_an_ambiguous_phrase_chooses_nothing(scene, vocabulary, words, folder, capsys) -> None:
+    layer = twins(scene, vocabulary, words)
+    phrase = f"the one {words[0]}"
+    # By its name: earlier tests left layers of objects in the scene.
+    options = replace(LOW, from_layer="twins")
+    found = query(scene, [phrase, words[1]], options=options, layers={"twins": layer})
+    assert found.ambiguous == (phrase,)
+    assert found.unknown == ()
+    assert found.found[phrase] == ()
+    assert len(found.references[phrase].referents) == 2
+    assert found.labels().present.tolist() == [2]
+    with pytest.raises(InputError, match="ambiguous, 2 candidates"):
+        found.selection()
+    save_scene_layer(layer, folder, "twins")
+    call = ["query", str(folder), phrase, "--from-layer", "twins", "--min-probability", "0.3"]
+    assert main([*call, "--report"]) == 0
+    assert f"{phrase}: ambiguous, 2 candidates: {words[0]} " in capsys.readouterr().out
+    assert "ambiguous, 2 candidates" in (folder / "reports" / "query.html").read_text()
+    assert main([*call, "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["words"][phrase] == []
+    assert facts["unknown"] == []
+    assert facts["references"][phrase]["status"] == "ambiguous"
+    assert len(facts["references"][phrase]["candidates"]) == 2
+    assert main([*call, "--layer", "one"]) == 2
+    assert "ambiguous, 2 candidates" in capsys.readouterr().err
+
+
+def test_the_command_explains_what_a_phrase_means(folder, scene, layers, words, capsys) -> None:
+    save_scene_layer(layers["objects"], folder, "drawn")
+    phrase = f"the {words[0]} nearest the {words[1]}"
+    call = ["query", str(folder), phrase, "--from-layer", "drawn", "--min-probability", "0.3"]
+    assert main([*call, "--layer", "one"]) == 0
+    out = capsys.readouterr().out
+    assert re.search(rf"{phrase}: {words[0]} \d: nearest {words[1]} \d\n", out)
+    assert re.search(r"%  thing \d, \d+ Gaussians at", out)
+    assert isinstance(load_scene_layer(folder, "one"), Selection)
+
+
+def test_what_phrases_that_refer_need(scene, vocabulary, layers, words) -> None:
+    phrase = f"two {words[0]}s"
+    with pytest.raises(InputError, match="every: expected words"):
+        query(scene, [phrase], options=replace(LOW, every=True), layers=layers)
+    with pytest.raises(InputError, match=f"recorded words, got '{phrase}'"):
+        query(scene, [phrase], options=replace(LOW, phrases="whole"), layers=layers)
+    with pytest.raises(InputError, match="which is not understood at 'or"):
+        query(scene, [f"{words[0]} or {words[1]}"], options=LOW, layers=layers)
+    with pytest.raises(InputError, match="recorded words, got 'zzz'"):
+        query(scene, [f"{words[0]} left of the zzz"], options=LOW, layers=layers)
+    with pytest.raises(InputError, match="distinct words"):
+        query(scene, [phrase, f" {phrase}"], options=LOW, layers=layers)
+
+
+def test_phrases_that_refer_need_objects(scene, vocabulary, words, monkeypatch) -> None:
+    layer = layer_of(scene, vocabulary, words)
+    module: Any = importlib.import_module("splatseg.tasks.query")
+    monkeypatch.setattr(module, "_THINGS", 1)
+    with pytest.raises(InputError, match="refers to objects, and layer 'own' has none"):
+        query(
+            scene,
+            [f"two {words[0]}s"],
+            options=replace(LOW, from_layer="own"),
+            layers={"own": layer},
+        )

@@ -9,13 +9,23 @@ import pytest
 import torch
 
 from splatseg.cli import main
-from splatseg.core import Selection
+from splatseg.core import Features, LayerInfo, Selection
 from splatseg.core.models import GroundedMasks, PromptableMasks, TextFeatures
 from splatseg.errors import InputError
-from splatseg.io.scene import load_scene, load_scene_layer
+from splatseg.io.evidence import FeatureEvidence, open_evidence
+from splatseg.io.scene import load_scene, load_scene_layer, save_scene_layer
+from splatseg.lift.vocabulary import vocabulary_of
 from splatseg.methods.prompt import PromptOptions
 from splatseg.prompting.prompts import Ball
-from splatseg.tasks import SelectOptions, TextModels, TextOptions, select_text, text_prompts
+from splatseg.tasks import (
+    QueryOptions,
+    SelectOptions,
+    TextModels,
+    TextOptions,
+    query,
+    select_text,
+    text_prompts,
+)
 
 WORD = "table"
 
@@ -202,3 +212,109 @@ def test_masks_are_asked_for_by_the_option_that_select_has(folder, capsys) -> No
         "--evidence: expected one of the sets of masks by name (masks_nested, masks_sam), got none"
         in said
     )
+
+
+@pytest.fixture(scope="module")
+def things(folder, scene) -> Path:
+    """The scene with a layer `objects`: two chairs at either end, and a table between them."""
+    evidence = open_evidence(scene.source / "features_text")
+    assert isinstance(evidence, FeatureEvidence)
+    vocabulary = vocabulary_of(evidence)
+    space = vocabulary.space
+    vectors = vocabulary.vectors(["chair", WORD, "chair"])
+    values = (vectors - space.mean) @ space.basis.T if space.basis is not None else vectors
+    values[2] *= 1 + 1e-6
+    place = scene.gaussians.means[:, 0].argsort().argsort() * 3 // len(scene.gaussians)
+    layer = Features(
+        values=values[place],
+        weights=torch.ones(len(place)),
+        info=LayerInfo(method="objects", evidence="features_text", options={"masks": "masks_sam"}),
+    )
+    made = Path(shutil.copytree(folder, folder.parent / "things"))
+    save_scene_layer(layer, made, "objects")
+    return made
+
+
+def test_a_phrase_that_refers_selects_its_object(things) -> None:
+    scene = load_scene(things)
+    place = scene.gaussians.means[:, 0].argsort().argsort() * 3 // len(scene.gaussians)
+    off = SelectOptions(post_processing="none")
+    ends = []
+    for view in scene.train_views:
+        chosen = replace(options(), view=view.name)
+        phrase = f"the chair left of the {WORD}"
+        answers = query(
+            scene, [phrase], options=QueryOptions(features="features_text", view=view.name)
+        )
+        if answers.references[phrase].status != "found":
+            with pytest.raises(InputError, match=f"{phrase}: "):
+                select_text(scene, [phrase], options=chosen, select_options=off)
+            continue
+        made = select_text(scene, [phrase], options=chosen, select_options=off)
+        (record,) = made.selection.info.details["prompts"]
+        assert record["status"] == "found"
+        assert f"left of {WORD} " in record["explanation"]
+        assert f"from view {view.name}" in record["explanation"]
+        assert made.selection.info.method == "query"
+        assert text_prompts(made.selection, scene) == ()
+        members = place[made.selection.mask].unique().tolist()
+        assert len(members) == 1
+        assert int(made.selection.mask.sum()) == int((place == members[0]).sum())
+        ends += members
+    assert set(ends) <= {0, 2}
+    assert ends
+
+
+def test_ambiguous_phrases_are_errors_unless_all_are_wanted(things) -> None:
+    scene = load_scene(things)
+    off = SelectOptions(post_processing="none")
+    with pytest.raises(InputError, match="ambiguous, 2 candidates: chair .*--objects all"):
+        select_text(scene, ["the one chair"], options=options())
+    with pytest.raises(InputError, match="nothing, expected 3, found 2"):
+        select_text(scene, ["three chairs"], options=options(objects="all"))
+    both = select_text(scene, ["the one chair"], options=options(objects="all"), select_options=off)
+    two = select_text(scene, ["two chairs"], options=options(), select_options=off)
+    assert torch.equal(both.selection.mask, two.selection.mask)
+    place = scene.gaussians.means[:, 0].argsort().argsort() * 3 // len(scene.gaussians)
+    assert torch.equal(two.selection.mask, place != 1)
+
+
+def test_words_and_phrases_together(things, table) -> None:
+    scene = load_scene(things)
+    off = SelectOptions(post_processing="none")
+    word = select_text(scene, [WORD], options=options(), select_options=off)
+    phrase = select_text(scene, ["two chairs"], options=options(), select_options=off)
+    both = select_text(scene, [WORD, "two chairs"], options=options(), select_options=off)
+    assert torch.equal(both.selection.mask, word.selection.mask | phrase.selection.mask)
+    records = both.selection.info.details["prompts"]
+    assert [one["word"] for one in records] == [WORD, "two chairs"]
+    # A grounder reads phrases itself.
+    model = Everything()
+    select_text(
+        scene,
+        ["two chairs"],
+        options=options(),
+        models=TextModels(grounder=model, prompter=model),
+    )
+    assert set(model.asked) == {"two chairs"}
+
+
+def test_the_command_selects_by_a_phrase(things, capsys) -> None:
+    call = ["select", str(things), "--evidence", "masks_sam", "--layer", "ends", "--text"]
+    assert main([*call, "two chairs"]) == 0
+    out = capsys.readouterr().out
+    assert "two chairs: chair " in out
+    assert main([*call, "two chairs", "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["references"][0]["status"] == "found"
+    assert facts["words"] == []
+    assert main([*call, "the one chair"]) == 2
+    err = capsys.readouterr().err
+    assert "ambiguous, 2 candidates" in err
+    assert err.count("\n") == 1
+    assert main([*call, "the one chair", "--objects", "all"]) == 0
+    view = load_scene(things).train_views[0].name
+    capsys.readouterr()
+    main([*call, f"the {WORD} left of the chairs", "--view", view])
+    captured = capsys.readouterr()
+    assert f"from view {view}" in captured.out + captured.err

@@ -31,6 +31,7 @@ from splatseg.tasks import (
     draw_query_result,
     write_query_report,
 )
+from splatseg.tasks.query import reference_record
 from splatseg.tasks.work import Work
 
 _LISTED = 5
@@ -49,11 +50,18 @@ class Command(OnScene):
     Each word is searched by itself: a phrase needs quotes. One word becomes a selection with
     --layer, several become labels with one id each.
 
+    Phrases may refer to objects by relations (left of, behind, on, under, near, between, with),
+    orders (largest, nearest the door, second from the left), counts (two mugs, how many mugs) and
+    negation (not on the desk, not red). The answer says why; of an ambiguous phrase it lists all
+    candidates and chooses none. Left and right are those of --view.
+
     For example:
 
     splatseg query room mug "desk lamp" keyboard
 
     splatseg query room mug --layer mugs --picture found
+
+    splatseg query room "the mug left of the laptop" "how many books on the shelf" --view front
 
     splatseg query room wall floor ceiling chair --every --layer classes
 
@@ -170,15 +178,25 @@ def _answered(answers: QueryResult, top: int) -> tuple[dict[str, Any], list[str]
         "surest": dict(answers.surest),
     }
     lines: list[str] = []
+    if answers.references:
+        facts["references"] = {
+            word: reference_record(reference) for word, reference in answers.references.items()
+        }
     for word in answers.words:
         found = answers.found[word]
         facts["words"][word] = [asdict(one) for one in found[:top]]
-        if not found:
+        reference = answers.references.get(word)
+        if reference is not None:
+            lines.append(reference.explanation)
+            if not found:
+                continue
+        elif not found:
             lines.append(f"{word}: unknown here ({answers.surest[word]:.1%} at most)")
             continue
         more = f", the surest {top} of them" if len(found) > top else ""
         count = "1 thing" if len(found) == 1 else f"{len(found)} things"
-        lines.append(f"{word}: {count}{more}")
+        if reference is None:
+            lines.append(f"{word}: {count}{more}")
         for one in found[:top]:
             x, y, z = one.centre
             lines.append(

@@ -100,13 +100,16 @@ class Command(OnScene):
     splatseg select room --sphere 0.4 0 1.2 0.3 --add-to mug --layer mug
 
     splatseg select room --text "red mug" --layer mug --picture found
+
+    splatseg select room --text "the mug left of the laptop" --view front --layer mug
     """
 
     layer: str = "selection"
     """Name of the layer to write."""
 
     view: str | None = None
-    """View of all prompts that name none. VIEW:X,Y is a point in another."""
+    """View of all prompts that name none, and from which left and right in --text are said.
+    VIEW:X,Y is a point in another."""
 
     point: _Pixel = ()
     """Pixel on the object. May be repeated, as all prompts below."""
@@ -137,10 +140,12 @@ class Command(OnScene):
 
     text: Annotated[tuple[str, ...], _Repeated, tyro.conf.arg(metavar="WORDS")] = ()
     """Word or phrase for the object, instead of clicks: found by recorded features and masks of the
-    views, or by models. `splatseg segment --method prompt` has more options."""
+    views, or by models. `splatseg segment --method prompt` has more options. Relations, orders,
+    counts and negation are resolved among the objects: "the mug left of the laptop"."""
 
     objects: Literal["one", "all"] = "one"
-    """With --text: select the object with the highest probability, or all that answer."""
+    """With --text: select the object with the highest probability, or all that answer. An ambiguous
+    phrase is an error that lists its candidates, unless all are wanted."""
 
     features: str | None = None
     """With --text: evidence of features in the space of words. None takes the only one."""
@@ -209,6 +214,8 @@ def run(command: Command) -> None:
         options = replace(command.selecting, mode=mode)
         if command.text:
             made = _by_text(command, scene, prompts, options, prompter=prompter, base=base)
+            for name, layer in made.made_layers.items():
+                save_scene_layer(layer, command.scene, name)
             prompts += text_prompts(made.selection, scene)
         else:
             made = _clicked(command, scene, prompts, options, prompter=prompter, base=base)
@@ -291,6 +298,7 @@ def _by_text(
         options=TextOptions(
             features=command.features,
             evidence=options.evidence,
+            view=command.view,
             prompt=PromptOptions(objects=command.objects),
         ),
         select_options=options,
@@ -362,6 +370,7 @@ def _facts(made: Selected, name: str, path: Path) -> dict[str, Any]:
         "confidence": None if mean is None else round(mean, 4),
         "source": made.source,
         "words": _word_facts(made),
+        "references": _reference_facts(made),
         "next_click": None
         if hint is None
         else {
@@ -388,6 +397,7 @@ def _lines(made: Selected) -> list[str]:
         f"{one['projected_views']} views"
         for one in _word_facts(made)
     ]
+    lines += [one["explanation"] for one in _reference_facts(made)]
     lines += [f"note: {warning}" for warning in made.warnings]
     if (hint := made.next_click) is not None:
         x, y = (float(v) for v in hint.point)
@@ -402,7 +412,13 @@ def _word_facts(made: Selected) -> list[dict[str, Any]]:
     """Of each object that answers: its word, how surely, and in how many views it has a mask."""
     found: Any = made.selection.info.details.get("prompts", [])
     keys = ("word", "probability", "projected_views", "masked_views")
-    return [{key: one[key] for key in keys} for one in found if "word" in one]
+    return [{key: one[key] for key in keys} for one in found if "projected_views" in one]
+
+
+def _reference_facts(made: Selected) -> list[dict[str, Any]]:
+    """Of each phrase that refers: what it means, and why."""
+    found: Any = made.selection.info.details.get("prompts", [])
+    return [dict(one) for one in found if "explanation" in one]
 
 
 @dataclass

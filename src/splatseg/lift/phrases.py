@@ -15,14 +15,14 @@ others are as sure as they come near it:
 .. math:: p_k = \max(p_b(\text{phrase}), p_b(\text{name})) \, e^{s_k - s_b}, \qquad b = \arg\max s
 
 Parts that a phrase does not have, or that nothing is known of, do not count: "mug" is what it was.
-Left, right, before and behind depend on who looks, and are not read.
+Left, right, before and behind depend on who looks; `lift.referring` reads them.
 
 References:
     CIE 15:2004, the colour space CIELAB and its distance of 1976.
 """
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -132,14 +132,14 @@ def parse_phrase(text: str) -> Phrase:
     return Phrase(
         text=text,
         called=called,
-        colour=_colour_of(called),
+        colour=colour_of(called),
         relation=None if reference is None else relation,
         reference=reference,
     )
 
 
-def _colour_of(called: str) -> tuple[float, float, float] | None:
-    """The first colour before a name; a colour alone is a name."""
+def colour_of(called: str) -> tuple[float, float, float] | None:
+    """CIELAB of the first colour before a name; a colour alone is a name."""
     words = called.lower().split()
     for at, word in enumerate(words[:-1]):
         if word in _COLOURS:
@@ -156,6 +156,20 @@ def _lab(colours: Float[Tensor, "k 3"]) -> Float[Tensor, "k 3"]:
     from skimage.color import rgb2lab
 
     return torch.from_numpy(np.asarray(rgb2lab(colours.double().numpy()), np.float32))
+
+
+def colour_distances(
+    colours: Float[Tensor, "k 3"], colour: tuple[float, float, float]
+) -> Float[Tensor, "k"]:
+    """Delta E of colours in CIELAB to one, lightness halved because shadows change it."""
+    away = colours - torch.tensor(colour)
+    away[:, 0] *= _LIGHTNESS
+    return away.norm(dim=1)
+
+
+def colour_words(words: Sequence[str]) -> tuple[bool, ...]:
+    """Which words name colours, or shades of them."""
+    return tuple(word.lower() in _COLOURS or word.lower() in _SHADES for word in words)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -276,13 +290,12 @@ def _called(
     if probabilities is not None:
         found = found + _NAME * probabilities.clamp_min(_LEAST_NAME).log()
     if phrase.colour is not None:
-        away = looks.colours - torch.tensor(phrase.colour)
-        away[:, 0] *= _LIGHTNESS
-        found = found - _COLOUR * away.norm(dim=1) / _DISTANCE
+        away = colour_distances(looks.colours, phrase.colour)
+        found = found - _COLOUR * away / _DISTANCE
     return found
 
 
-def _names(vocabulary: Vocabulary) -> frozenset[str]:
+def vocabulary_names(vocabulary: Vocabulary) -> frozenset[str]:
     """Recorded words that are called so: classes and their synonyms."""
     recorded = vocabulary.recorded
     if recorded is None:
@@ -301,7 +314,7 @@ def known_name(called: str, vocabulary: Vocabulary) -> str | None:
     if vocabulary.encoder is not None:
         plain = [word for word in words if word.lower() not in (*_COLOURS, *_SHADES)]
         return " ".join(plain) or None
-    names = _names(vocabulary)
+    names = vocabulary_names(vocabulary)
     return next((end for at in range(len(words)) if (end := " ".join(words[at:])) in names), None)
 
 
@@ -339,7 +352,7 @@ def match_phrases(
     """
     scores, sure = TEMPERATURE * answers.cosines, answers.probabilities.clone()
     asked: dict[str, Tensor | None] = {}
-    names = _names(vocabulary)  # "white board" is one, and is not taken apart
+    names = vocabulary_names(vocabulary)  # "white board" is one, and is not taken apart
 
     def name(called: str) -> Tensor | None:
         if called not in asked:

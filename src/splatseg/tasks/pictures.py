@@ -358,9 +358,14 @@ def _summary(answers: QueryResult) -> str:
         if (found := answers.found[word])
     ]
     unknown = ", ".join(answers.unknown)
+    said = [f"{reference.explanation}." for reference in answers.references.values()]
     return " ".join(
         sentence
-        for sentence in (f"{', '.join(here)}." if here else "", unknown and f"Unknown: {unknown}.")
+        for sentence in (
+            f"{', '.join(here)}." if here else "",
+            unknown and f"Unknown: {unknown}.",
+            *said,
+        )
         if sentence
     )
 

@@ -14,6 +14,16 @@ from splatseg.core.boundary import boundary
 from splatseg.core.models import TextFeatures
 from splatseg.errors import InputError
 from splatseg.lift.phrases import ThingLooks, match_phrases, thing_looks
+from splatseg.lift.referring import (
+    NounPhrase,
+    ObjectNames,
+    Reference,
+    Resolver,
+    name_list,
+    object_geometry,
+    referring_readings,
+    viewer_of,
+)
 from splatseg.lift.words import WordIndex, WordMatches
 from splatseg.methods.voxels.words import VoxelWords
 from splatseg.render import BackendName
@@ -60,7 +70,7 @@ class QueryResult:
 
     found: Mapping[str, tuple[Found, ...]]
     """Things by word, the surest first, of those that are equal to a percent the larger; none where
-    the word is unknown here."""
+    the word is unknown here, or a phrase is ambiguous."""
 
     surest: Mapping[str, float]
     """The largest probability of anything by word, also where that is not enough to answer."""
@@ -79,6 +89,10 @@ class QueryResult:
     made_layers: Mapping[str, Layer] = field(default_factory=dict[str, Layer])
     """Layers that were made to answer, by the names to keep them under: with them the next query
     answers at once."""
+
+    references: Mapping[str, Reference] = field(default_factory=dict[str, Reference])
+    """Of phrases that refer by relations, orders or counts: what they mean and why, or between
+    which candidates they do not decide."""
 
     pieces: Int64[Tensor, "n words"] | None = None
     """Connected pieces of Gaussians by word, -1 outside, where these are the things; None where
@@ -103,12 +117,24 @@ class QueryResult:
             raise InputError("pieces: expected those of Gaussians that read voxels, got none.")
         inside = self.probabilities >= self.options.min_probability
         rows = self.index.rows[:, None]
+        for word, reference in self.references.items():
+            meant = torch.tensor(reference.things, dtype=torch.int64)
+            inside[:, self.words.index(word)] = torch.isin(self.index.rows, meant)
         return torch.where(inside & (rows >= 0), rows, UNLABELLED)
 
     @property
     def unknown(self) -> tuple[str, ...]:
         """Words that nothing answers to."""
-        return tuple(word for word in self.words if not self.found[word])
+        return tuple(
+            word for word in self.words if not self.found[word] and word not in self.ambiguous
+        )
+
+    @property
+    def ambiguous(self) -> tuple[str, ...]:
+        """Phrases that several things may be meant by, see `references`."""
+        return tuple(
+            word for word, reference in self.references.items() if reference.status == "ambiguous"
+        )
 
     @boundary
     def of_thing(self, word: str, thing: int) -> Selection:
@@ -125,8 +151,10 @@ class QueryResult:
         """Everything that answers to the words, with the probability of the likeliest.
 
         Raises:
-            InputError: If nothing does.
+            InputError: If nothing does, or a phrase is ambiguous; the message has its candidates.
         """
+        for word in self.ambiguous:
+            raise InputError(f"words: {self.references[word].explanation}.")
         inside = (self.things >= 0).any(dim=1)
         if not bool(inside.any()):
             raise InputError(f"words: nothing in the scene answers to {', '.join(self.words)}.")
@@ -164,10 +192,24 @@ class QueryResult:
 
 def query_record(answers: QueryResult) -> dict[str, Any]:
     """What was found, as values that JSON holds."""
-    return {
+    record: dict[str, Any] = {
         "words": list(answers.words),
         "found": {word: [asdict(one) for one in answers.found[word]] for word in answers.words},
         "surest": dict(answers.surest),
+    }
+    if answers.references:
+        record["references"] = {
+            word: reference_record(reference) for word, reference in answers.references.items()
+        }
+    return record
+
+
+def reference_record(reference: Reference) -> dict[str, Any]:
+    """What a phrase means, as values that JSON holds."""
+    return {
+        "status": reference.status,
+        "explanation": reference.explanation,
+        "candidates": [asdict(one) for one in reference.referents],
     }
 
 
@@ -203,6 +245,8 @@ class QuerySession:
         self._scene = scene
         self._options = options or QueryOptions()
         work = Work(scene=scene, layers=layers, backend=backend, observer=observer)
+        if self._options.view is not None:
+            scene.view(self._options.view)  # a name that is none is told before anything is read
         self._source = word_source(work, self._options, encoder=encoder, words=words)
         if len(self._source.features) != len(scene.gaussians):
             raise InputError(
@@ -241,12 +285,20 @@ class QuerySession:
         """Which things answer to words, and how surely.
 
         Args:
-            words: Words or phrases; each is asked for by itself.
+            words: Words or phrases; each is asked for by itself. Phrases that refer by relations,
+                orders, counts or negation are resolved among the objects (`lift.referring`).
 
         Raises:
-            InputError: If there are none, one is there twice, or nothing is known of one.
+            InputError: If there are none, one is there twice, nothing is known of one, or a phrase
+                refers and there are no objects.
         """
-        asked = self._in_parts(self._index.ask(words))
+        readings = self._readings(words)
+        plain = [word for word in words if word.strip() not in readings]
+        references: dict[str, Reference] = {}
+        if readings:
+            asked, references = self._with_references(words, plain, readings)
+        else:
+            asked = self._in_parts(self._index.ask(words))
         for word in asked.words:
             if asked.words.count(word) > 1:
                 raise InputError(f"words: expected distinct words, got {word!r} more than once.")
@@ -254,7 +306,8 @@ class QuerySession:
         return QueryResult(
             words=asked.words,
             found={
-                word: self._found(asked, column, pieces) for column, word in enumerate(asked.words)
+                word: self._found(asked, column, pieces, references.get(word))
+                for column, word in enumerate(asked.words)
             },
             surest={
                 word: round(float(asked.probabilities[:, column].max()), 6)
@@ -265,7 +318,85 @@ class QuerySession:
             layer=self._source.layer,
             options=self._options,
             made_layers=self._source.made_layers,
+            references=references,
             pieces=pieces,
+        )
+
+    def _readings(self, words: Sequence[str]) -> dict[str, tuple[NounPhrase, ...]]:
+        """Phrases that refer, with what they can be read as."""
+        if self._options.phrases == "whole":
+            return {}
+        found: dict[str, tuple[NounPhrase, ...]] = {}
+        for word in words:
+            readings = referring_readings(word, self._index.vocabulary)
+            if readings is not None:
+                found[word.strip()] = readings
+        if not found:
+            return found
+        first = next(iter(found))
+        if self._options.every:
+            raise InputError(f"every: expected words, which classes have, got {first!r}.")
+        if self._places is None or isinstance(self._index, VoxelWords):
+            raise InputError(
+                f"words: {first!r} refers to objects, and layer {self._source.layer!r} has none; "
+                "expected one that `segment --method objects` makes, or --phrases whole."
+            )
+        return found
+
+    def _with_references(
+        self,
+        words: Sequence[str],
+        plain: Sequence[str],
+        readings: Mapping[str, tuple[NounPhrase, ...]],
+    ) -> tuple[WordMatches, dict[str, Reference]]:
+        """What words answer, with a column for each phrase that refers: its things, and no more."""
+        asked = self._in_parts(self._index.ask(plain)) if plain else None
+        count = len(self._index)
+        columns: list[tuple[Tensor, Tensor]] = []
+        references: dict[str, Reference] = {}
+        for word in words:
+            said = word.strip()
+            if asked is not None and said not in readings:
+                column = asked.words.index(said)
+                columns.append((asked.cosines[:, column], asked.probabilities[:, column]))
+                continue
+            reference = self._resolver.resolve(readings[said], said)
+            references[said] = reference
+            probabilities = torch.zeros(count)
+            if reference.status == "found":
+                for one in reference.referents:
+                    probabilities[one.thing] = one.probability
+            columns.append((torch.zeros(count), probabilities))
+        return (
+            WordMatches(
+                words=tuple(word.strip() for word in words),
+                cosines=torch.stack([cosines for cosines, _ in columns], dim=1),
+                probabilities=torch.stack([sure for _, sure in columns], dim=1),
+            ),
+            references,
+        )
+
+    @cached_property
+    def _resolver(self) -> Resolver:
+        """Resolves phrases among the things; its geometry is worked out once."""
+        index, scene, options = self._index, self._scene, self._options
+        if isinstance(index, VoxelWords):
+            raise InputError("words: expected things, got voxels.")
+        names = ObjectNames(
+            name_list(index.vocabulary),
+            lambda name: index.ask([name]).probabilities[:, 0],
+            lambda: self._looks.colours,
+            min_probability=options.min_probability,
+        )
+        views = scene.train_views or scene.views
+        view = scene.view(options.view) if options.view is not None else next(iter(views), None)
+        return Resolver(
+            object_geometry(scene.gaussians, index.rows, up=scene.up),
+            names.match,
+            colour=names.colour,
+            viewer=None
+            if view is None
+            else viewer_of(view.name, view.camera.cam_from_world, up=scene.up),
         )
 
     def _in_parts(self, asked: WordMatches) -> WordMatches:
@@ -309,13 +440,20 @@ class QuerySession:
         ]
         return torch.stack(columns, dim=1)
 
-    def _found(self, asked: WordMatches, column: int, pieces: Tensor | None) -> tuple[Found, ...]:
+    def _found(
+        self,
+        asked: WordMatches,
+        column: int,
+        pieces: Tensor | None,
+        reference: Reference | None,
+    ) -> tuple[Found, ...]:
         """The things that answer to one word, in the order of `QueryResult.found`."""
         probabilities, cosines = asked.probabilities[:, column], asked.cosines[:, column]
         if pieces is None:
             places = self._places or {}
             answering = torch.nonzero(probabilities >= self._options.min_probability).flatten()
-            rows = {row: torch.tensor([row]) for row in answering.tolist()}
+            meant = answering.tolist() if reference is None else reference.things
+            rows = {row: torch.tensor([row]) for row in meant}
         else:
             probabilities, cosines = (
                 self._index.of_gaussians(found[:, None])[:, 0] for found in (probabilities, cosines)

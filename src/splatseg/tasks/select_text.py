@@ -2,26 +2,35 @@
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, cast
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatseg.core import JSON, LayerInfo, PromptableMasks, Scene, Selection
+from splatseg.core import JSON, Layer, LayerInfo, PromptableMasks, Scene, Selection
 from splatseg.core.boundary import boundary
 from splatseg.core.models import GroundedMasks, TextFeatures
 from splatseg.core.options import options
 from splatseg.errors import InputError
 from splatseg.io.evidence import Evidence, FeatureEvidence
+from splatseg.lift.referring import referring_readings
+from splatseg.lift.vocabulary import vocabulary_of
 from splatseg.methods.prompt import PromptOptions, PromptSession, PromptSources, selection_of
 from splatseg.prompting.pipeline import SceneIndex, SelectionContext, postprocess
 from splatseg.prompting.prompts import Solid, ViewPrompt
 from splatseg.prompting.seen import ViewCache
 from splatseg.render import BackendName
+from splatseg.tasks.query import QueryResult, QuerySession, reference_record
 from splatseg.tasks.select import Selected, check_base, combined, prompt_record, within
-from splatseg.tasks.sources import STEPS, SelectOptions, feature_evidence, mask_name
+from splatseg.tasks.sources import (
+    STEPS,
+    QueryOptions,
+    SelectOptions,
+    feature_evidence,
+    mask_name,
+)
 from splatseg.tasks.work import SILENT, Observer, Work, layer_versions
 
 # Prompts as the record of a layer holds them.
@@ -31,6 +40,9 @@ from splatseg.tasks.work import SILENT, Observer, Work, layer_versions
 
 
 _KINDS = ("masks", "panoptic", "tracked")
+
+_MEMBER = 0.501
+"""Least confidence of a Gaussian of an object that is meant."""
 
 
 @options
@@ -43,6 +55,10 @@ class TextOptions:
 
     evidence: str | None = None
     """Evidence of masks. None takes the only one."""
+
+    view: str | None = None
+    """View from which left, right, in front and behind are said. None takes the first of
+    training."""
 
     prompt: PromptOptions = field(default_factory=PromptOptions)
     """How words become masks, points and votes; its words and its names of evidence and models are
@@ -79,7 +95,9 @@ def select_text(
     """The Gaussians that words mean, as Prompt SA-GS finds them.
 
     Words are looked for in a few train views, points of the masks found there become points of
-    the world, these give a mask in every view, and the masks vote (`methods.prompt`).
+    the world, these give a mask in every view, and the masks vote (`methods.prompt`). Phrases that
+    refer by relations, orders, counts or negation are resolved among the objects of the scene, as
+    `query` does (`lift.referring`); a grounder reads them itself.
 
     What the command ``splatseg select --text`` does.
 
@@ -95,39 +113,61 @@ def select_text(
         observer: Is told of the progress.
 
     Raises:
-        InputError: If the scene has nothing that answers to words, nothing is known of one, or
-            nothing in it answers.
+        InputError: If the scene has nothing that answers to words, nothing is known of one,
+            nothing in it answers, or a phrase is ambiguous and not all objects are wanted: the
+            message has the candidates.
     """
     options, models = options or TextOptions(), models or TextModels()
     chosen = select_options or SelectOptions()
     check_base(scene, base, chosen)
     began = time.perf_counter()
-    asked = replace(options.prompt, words=tuple(words), point=())
     if not scene.train_views:
         raise InputError("views: expected train views to look for words in, the scene has none.")
     work = Work(scene=scene, backend=backend, observer=observer)
     features, masks = _evidence(work, options, models)
-    session = PromptSession(
-        scene.gaussians,
-        scene.train_views,
-        PromptSources(
-            features=features,
-            masks=masks,
-            grounder=models.grounder,
-            prompter=models.prompter,
+    phrases = _referring(words, features, options, models)
+    plain = tuple(word for word in words if word.strip() not in phrases)
+    parts: list[Selection] = []
+    seconds: dict[str, float] = {}
+    made_layers: Mapping[str, Layer] = {}
+    if plain or not phrases:
+        asked = replace(options.prompt, words=plain, point=())
+        session = PromptSession(
+            scene.gaussians,
+            scene.train_views,
+            PromptSources(
+                features=features,
+                masks=masks,
+                grounder=models.grounder,
+                prompter=models.prompter,
+                encoder=models.encoder,
+            ),
+            options=asked,
+            seed=chosen.seed,
+            up=scene.up,
+            backend=backend,
+        )
+        seconds["open"] = time.perf_counter() - began
+        with observer.stage("select") as step:
+            made = session.ask(plain, progress=step)
+        seconds |= made.seconds
+        parts.append(selection_of(made, session, asked))
+    if phrases:
+        began = time.perf_counter()
+        answers = QuerySession(
+            scene,
+            options=QueryOptions(
+                features=options.features, masks=options.evidence, view=options.view
+            ),
             encoder=models.encoder,
-        ),
-        options=asked,
-        seed=chosen.seed,
-        up=scene.up,
-        backend=backend,
-    )
-    seconds = {"open": time.perf_counter() - began}
-    with observer.stage("select") as step:
-        made = session.ask(words, progress=step)
-    seconds |= made.seconds
-    found = selection_of(made, session, asked)
-    confidence, steps = _cleaned(work, made.confidence, chosen)
+            backend=backend,
+            observer=observer,
+        ).ask(phrases)
+        made_layers = answers.made_layers
+        parts.append(_referred(answers, several=options.prompt.objects == "all"))
+        seconds["refer"] = time.perf_counter() - began
+    found = _joined(parts)
+    confidence, steps = _cleaned(work, _confidence(found), chosen)
     confidence = within(confidence, [place.contains(scene.gaussians) for place in places])
     selection = combined(Selection.of_confidence(confidence), base, chosen.mode)
     evidence = None if features is None else features.folder.name
@@ -136,7 +176,58 @@ def select_text(
         seconds={**seconds, **steps},
         source="text",
         warnings=() if selection.count else ("Nothing is selected.",),
+        made_layers=made_layers,
     )
+
+
+def _referring(
+    words: Sequence[str],
+    features: FeatureEvidence | None,
+    options: TextOptions,
+    models: TextModels,
+) -> tuple[str, ...]:
+    """The words that are phrases to resolve among objects."""
+    if features is None or options.prompt.phrases == "whole":
+        return ()
+    vocabulary = vocabulary_of(features, models.encoder)
+    return tuple(word.strip() for word in words if referring_readings(word, vocabulary) is not None)
+
+
+def _referred(answers: QueryResult, *, several: bool) -> Selection:
+    """The objects that phrases mean; of ambiguous ones all candidates, or an error."""
+    rows = answers.vectors.probabilities.new_zeros(len(answers.index))
+    records: list[JSON] = []
+    for word, reference in answers.references.items():
+        if reference.status == "nothing" or (reference.status == "ambiguous" and not several):
+            hint = "" if reference.status == "nothing" else " (all of them with --objects all)"
+            raise InputError(f"words: {reference.explanation}{hint}.")
+        for one in reference.referents:
+            rows[one.thing] = max(one.probability, _MEMBER)
+        records.append({"word": word, **reference_record(reference)})
+    confidence = answers.index.of_gaussians(rows[:, None])[:, 0].float().clamp(0, 1)
+    info = LayerInfo(
+        method="query",
+        options={**asdict(answers.options), "from_layer": answers.layer},
+        details={"prompts": records},
+    )
+    return Selection.of_confidence(confidence, info=info)
+
+
+def _joined(parts: Sequence[Selection]) -> Selection:
+    """One selection of what words and phrases gave, with all records."""
+    first, *others = parts
+    if not others:
+        return first
+    confidence = torch.stack([_confidence(one) for one in parts]).amax(dim=0)
+    details = dict(first.info.details)
+    details["prompts"] = [
+        prompt for one in parts for prompt in cast("list[JSON]", one.info.details["prompts"])
+    ]
+    return Selection.of_confidence(confidence, info=replace(first.info, details=details))
+
+
+def _confidence(selection: Selection) -> Float[Tensor, "n"]:
+    return selection.mask.float() if selection.confidence is None else selection.confidence
 
 
 def _evidence(

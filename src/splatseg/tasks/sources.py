@@ -153,7 +153,12 @@ class QueryOptions:
 
     phrases: Literal["parts", "whole"] = "parts"
     """How a phrase such as "red mug on the desk" is compared with objects. parts: its name, colour,
-    and what it stands on or near count beside its cosine. whole: the cosine alone."""
+    and what it stands on or near count beside its cosine; phrases without a vector of their own
+    that relate, order, count or negate are resolved among the objects. whole: the cosine alone."""
+
+    view: str | None = None
+    """View from which left, right, in front and behind are said. None takes the first of
+    training."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
