@@ -32,7 +32,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from splatseg._check import check_values
-from splatseg.core import Gaussians, Selection, View
+from splatseg.core import Gaussians, MaskSet, Selection, View
 from splatseg.errors import InputError, ShapeError
 from splatseg.neighbours import NeighbourIndex, Subset
 from splatseg.prompting import next_click as _clicks
@@ -357,7 +357,8 @@ def _by_masks(
     for prompt in context.prompts:
         if prompt.inside is None or prompt.guessed:
             continue
-        within, visible = context.views.mask_masses(prompt.view, prompt.inside)
+        masks = MaskSet.from_dense(prompt.inside[None])
+        (within,), visible = context.views.mask_masses(prompt.view, masks)
         seen = visible > _SEEN
         good = seen & (within >= _INSIDE * visible)
         bad = seen & (within < _INSIDE * visible)

@@ -190,7 +190,7 @@ class PropagatedMasks:
         known = self._empty()
         for one in prompts:
             if one.inside is not None and one.masked and one.view not in known.views:
-                known.add(one.view, *self._cache.mask_masses(one.view, one.inside))
+                self._count(known, one.view, one.inside)
         return known if known.views else None
 
     def _meant(
@@ -243,12 +243,22 @@ class PropagatedMasks:
         """The model's masks on the Gaussians, scored by how much of what was clicked is inside."""
         found = self._model.prompted_masks(self._model.embed(self._image_of(view)), prompt)
         scores: list[float] = found.scores.tolist()
-        made: list[_Candidate] = []
-        for i, score in enumerate(scores):
-            inside, total = self._cache.mask_masses(view, found.dense(i))
-            share = float((seed * inside).sum() / (seed * total).sum().clamp_min(1e-9))
-            made.append(_Candidate(view=view, inside=inside, total=total, score=score * share))
-        return made
+        if not scores:
+            return []
+        every, total = self._cache.mask_masses(view, found)
+        shown = (seed * total).sum().clamp_min(1e-9)
+        return [
+            _Candidate(
+                view=view, inside=inside, total=total,
+                score=score * float((seed * inside).sum() / shown),
+            )
+            for inside, score in zip(every, scores, strict=True)
+        ]  # fmt: skip
+
+    def _count(self, known: _Known, view: View, mask: Bool[Tensor, "height width"]) -> None:
+        """Add what a mask says."""
+        (inside,), total = self._cache.mask_masses(view, MaskSet.from_dense(mask[None]))
+        known.add(view, inside, total)
 
     def _seed(self, prompts: Sequence[VisiblePrompt]) -> Float[Tensor, "n"]:
         """Blending weights of the positive pixels."""
@@ -300,7 +310,7 @@ class PropagatedMasks:
             if not accepted or mask is None:
                 continue
             before = shares > 0.5
-            known.add(view, *self._cache.mask_masses(view, mask))
+            self._count(known, view, mask)
             after = known.shares() > 0.5
             same = int((before ^ after).sum()) <= _STABLE * int(after.sum())
             unchanged = unchanged + 1 if same else 0

@@ -20,7 +20,16 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from splatseg._check import check_shape
-from splatseg.core import Camera, Edited, Gaussians, LabelMap, Labels, View, apply_rows
+from splatseg.core import (
+    Camera,
+    Edited,
+    Gaussians,
+    LabelMap,
+    Labels,
+    MaskSet,
+    View,
+    apply_rows,
+)
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.options import Count
 from splatseg.errors import InputError
@@ -135,18 +144,18 @@ class ViewCache:
         return replace(found, ids=ids, gaussians=len(self._gaussians))
 
     def mask_masses(
-        self, view: View, mask: Bool[Tensor, "height width"]
-    ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
-        """What a view shows of each Gaussian inside a mask, and at all: sums of weights, pixels."""
+        self, view: View, masks: MaskSet
+    ) -> tuple[Float[Tensor, "masks n"], Float[Tensor, "n"]]:
+        """What a view shows of each Gaussian inside masks, and at all: sums of weights, pixels."""
         # Rows of what the view shows, which after an edit are not the scene's.
         shown = self.shown(view)
-        labels = LabelMap(ids=mask.to(torch.int32))
-        found = view_masses(shown.gaussians, view.camera, labels, backend=self._backend)
-        own = found.segment == 1
-        within, visible = torch.zeros(2, len(self._gaussians))
-        within.index_add_(0, shown.rows[found.gaussian[own]], found.weight[own])
+        found = view_masses(shown.gaussians, view.camera, masks, backend=self._backend)
+        inside = torch.zeros(len(masks), len(self._gaussians))
+        rows = shown.rows[found.gaussian]
+        inside.index_put_((found.segment, rows), found.weight, accumulate=True)
+        visible = torch.zeros(len(self._gaussians))
         visible.index_add_(0, shown.rows, found.visible)
-        return within, visible
+        return inside, visible
 
     def label_map(self, view: View, labels: Labels) -> LabelMap:
         """What a view shows of labels of the Gaussians."""
