@@ -15,6 +15,7 @@ from splatseg._check import check_shape
 from splatseg.core import Camera, Gaussians, Labels, View
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError
+from splatseg.io.arrays import read_npy
 from splatseg.lift.label_maps import view_label_map
 from splatseg.render import prepare
 from splatseg.render.warp import undistorted_camera
@@ -103,19 +104,16 @@ class MapStore:
         """Keep the maps of one more view."""
         for name, dtype in _DTYPES.items():
             values = getattr(maps, name).numpy().astype(dtype, copy=False)
-            np.ascontiguousarray(values).tofile(self._path(len(self), name))
+            np.save(self._path(len(self), name), np.ascontiguousarray(values))
         self._counts.append(maps.counts)
         self._cameras.append(maps.camera)
 
     def __getitem__(self, index: int) -> ViewMaps:
         camera = self._cameras[index]
-        size = (camera.height, camera.width)
-        maps: dict[str, Tensor] = {}
-        for name, dtype in _DTYPES.items():
-            shape = (*size, 3) if name == "colour" else size
-            # Copy on write: torch knows no arrays that cannot be written to.
-            values = np.memmap(self._path(index, name), dtype, mode="c", shape=shape)
-            maps[name] = torch.from_numpy(values)
+        maps: dict[str, Tensor] = {
+            name: torch.from_numpy(read_npy(self._path(index, name), mapped=True))
+            for name in _DTYPES
+        }
         return ViewMaps(camera=camera, **maps)
 
     def pixels_of(self, id: int) -> Sequence[int]:
@@ -128,7 +126,7 @@ class MapStore:
         return tuple(self._cameras)
 
     def _path(self, index: int, name: str) -> Path:
-        return self._folder / f"{index}.{name}"
+        return self._folder / f"{index}.{name}.npy"
 
 
 _DTYPES = {"depth": np.float32, "ids": np.int32, "colour": np.uint8}
