@@ -16,6 +16,7 @@ from splatseg.io.evidence import open_evidence, save_depth_map, save_label_map
 from splatseg.io.images import load_image
 from splatseg.models import EvidenceRequest, record_evidence, recorded_model
 from splatseg.models._images import LastImages
+from splatseg.models._written import Pictures
 from splatseg.render.cpu import set_threads
 
 
@@ -288,3 +289,13 @@ def test_what_is_refused(views, tmp_path) -> None:
             tmp_path / "g",
             EvidenceRequest(what="depth"),
         )
+
+
+def test_a_picture_that_another_thread_forgets_is_still_given(views, tmp_path) -> None:
+    class Forgetful(dict):
+        def __setitem__(self, key, value) -> None:
+            """Gone at once, as if the thread that writes came in between."""
+
+    pictures = Pictures(None)
+    pictures._kept = Forgetful()
+    assert torch.equal(pictures.of(views[0], tmp_path), load_image(views[0]))

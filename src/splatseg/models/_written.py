@@ -166,11 +166,12 @@ class Pictures:
         """The picture of a view, for evidence that is written to a folder."""
         # What is drawn is kept beside each kind; a photograph is the same for all.
         key = (view.name, folder if view.image is None else None)
-        if key not in self._kept:
-            self._kept[key] = (
-                load_image(view) if self._image_of is None else self._image_of(view, folder)
-            )
-        return self._kept[key]
+        # Another thread may forget them in between.
+        picture = self._kept.get(key)
+        if picture is None:
+            picture = load_image(view) if self._image_of is None else self._image_of(view, folder)
+            self._kept[key] = picture
+        return picture
 
     def forget(self) -> None:
         """Let go of the pictures: other views come."""

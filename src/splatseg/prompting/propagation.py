@@ -152,6 +152,7 @@ class PropagatedMasks:
         self._views = tuple(views)
         self._model = model
         self._cache = cache
+        self._means = cache.gaussians.means.detach().cpu().double()
         self._neighbours = neighbours
         self._image_of = image_of
         self._report = report
@@ -270,10 +271,9 @@ class PropagatedMasks:
 
     def _brightest(self, view: View, seed: Tensor) -> tuple[float, float] | None:
         """The pixel that shows most of the clicked Gaussians; None where they are hidden."""
-        drawn = self._drawn(view, torch.stack((seed, torch.ones_like(seed)), dim=1))
-        best = int(drawn[..., 0].argmax())
-        row, column = divmod(best, drawn.shape[1])
-        if float(drawn[row, column, 0]) < _MIN_SEED:
+        drawn = self._drawn(view, seed[:, None])[..., 0]
+        row, column = divmod(int(drawn.argmax()), drawn.shape[1])
+        if float(drawn[row, column]) < _MIN_SEED:
             return None
         return (column + 0.5, row + 0.5)
 
@@ -335,7 +335,7 @@ class PropagatedMasks:
         self, left: Sequence[View], used: Sequence[View], weights: Float[Tensor, "n"]
     ) -> View | None:
         """The view with most of the weight in its image, from another side."""
-        means = self._cache.gaussians.means.detach().cpu().double()
+        means = self._means
         centre = (means * weights[:, None]).sum(0) / weights.sum().clamp_min(1e-9)
         seen = torch.stack([_towards(view, centre) for view in used])
         full = _pixels_a_unit(used[0], centre)
