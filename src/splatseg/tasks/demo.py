@@ -51,7 +51,7 @@ class DemoOptions:
     """Room, number of photographs, and length of the fit."""
 
     minutes: float | None = None
-    """Length of the fit, minutes. None takes 1.25, unless `steps` is given."""
+    """Length of the fit, minutes. None takes 1, unless `steps` is given."""
 
     steps: int | None = None
     """Length of the fit in steps instead: same seed, same result."""
@@ -280,7 +280,7 @@ class _MainJob:
 
     def _minutes(self) -> float | None:
         options = self.options
-        return 1.25 if options.minutes is None and options.steps is None else options.minutes
+        return 1.0 if options.minutes is None and options.steps is None else options.minutes
 
     def _fit_words(self) -> list[object]:
         options, minutes = self.options, self._minutes()
