@@ -18,6 +18,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from splatseg.core import Capture
+from splatseg.core.threads import one_torch_thread
 from splatseg.evaluate import evaluate_photographs
 from splatseg.fit import FitOptions, _run, _step
 from splatseg.fit._photographs import TrainingPhotographs
@@ -74,7 +75,7 @@ def main() -> None:
     marks = sorted({*arguments.marks, arguments.minutes})
     run = _run.FitRun(capture, options, get_backend("cpu"), photographs)
     before, steps, last = dict(run.stages), 0, (0, 0.0)
-    with _run.one_torch_thread():
+    with one_torch_thread():
         for mark in marks:
             while not run.finished and run.seconds < 60 * mark:
                 status = run.step()

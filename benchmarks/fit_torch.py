@@ -25,11 +25,12 @@ from torch import Tensor
 from splatseg.core import Camera
 from splatseg.core.rigid import rotation_from_quaternion
 from splatseg.core.sh import evaluate_sh
+from splatseg.core.threads import one_torch_thread
 from splatseg.fit import FitOptions
 from splatseg.fit._options import COLOUR_RATE, OPACITY_RATE, RATES, ROTATION_RATE
 from splatseg.fit._parameters import Parameters
 from splatseg.fit._photographs import TrainingPhotographs
-from splatseg.fit._run import FitRun, one_torch_thread
+from splatseg.fit._run import FitRun
 from splatseg.fit._step import l1_dssim
 from splatseg.io.captures import read_capture
 from splatseg.render import default_options, get_backend, render
