@@ -63,7 +63,7 @@ class FillBy:
     """Names of the views that saw the scene."""
 
     inpainter: str = "opencv"
-    """Name of the model that paints them, see `fill.find_inpainter`."""
+    """Name of the model that paints them, see `find_inpainter`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -14,7 +14,7 @@ import torch
 from splatseg.core import Edited, Gaussians, Scene, Selection, Similarity, View
 from splatseg.core.boundary import boundary
 from splatseg.edit.document import HISTORY, Document, FillBy, Operation, Recolour, load_document
-from splatseg.edit.fill import exposed, fill, filled_layer, find_inpainter
+from splatseg.edit.holes import exposed, fill, filled_layer, find_inpainter
 from splatseg.edit.operations import (
     duplicate,
     extract,

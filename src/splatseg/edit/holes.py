@@ -77,7 +77,7 @@ _MOST_CELLS = 384
 _SEEN = 0.5
 """Weight of the thing above which a pixel is its."""
 
-_SUPPORT, _MIN_VISIBILITY, _EXPOSED_ROUNDS = 0.2, 1.0, 3
+_SUPPORT, _MIN_VISIBILITY, _EXPOSED_ROUNDS = 0.2, 1.0, 2
 """Share of what views see of a Gaussian after a removal that they must have seen before, the least
 that they see after it, in pixels, and how often this is asked."""
 
@@ -217,7 +217,7 @@ def exposed(
 
     What lies inside a thing or behind it was hardly seen, so that its colour and place are
     arbitrary. A Gaussian is meant if the views see it five times as much after the removal as
-    before; as others appear behind it, that is asked again, three times in all.
+    before; as others appear behind it, that is asked twice.
 
     Args:
         gaussians: The scene with the thing.
@@ -375,8 +375,14 @@ class _Removal:
             thing=(drawn.image[..., 0] > _SEEN).cpu().numpy(),
             before=_surface(drawn.median_depth),
             after=_surface(left.median_depth),
-            image=left.image.clamp(0, 1).cpu().double().numpy(),
+            image=_colours(left),
         )
+
+
+def _colours(drawn: Rendered) -> Array:
+    """Colours without the black behind what is not quite opaque."""
+    alpha = drawn.alpha.clamp_min(_SEEN)[..., None]
+    return (drawn.image / alpha).clamp(0, 1).cpu().double().numpy()
 
 
 def _surface(depth: Tensor) -> Array:
@@ -528,7 +534,7 @@ class _Sheet:
     @property
     def known(self) -> Mask:
         """Cells that views saw."""
-        return (self.seen >= _FREE_VIEWS) & (self.weights > 0)
+        return (self.seen >= np.maximum(self.free, _FREE_VIEWS)) & (self.weights > 0)
 
     @property
     def image(self) -> Array:
@@ -541,6 +547,11 @@ class _Sheet:
         found = (self.free < _FREE_VIEWS) & (self.seen < _FREE_VIEWS)
         # Depths of faint texture err here and there.
         return cv2.morphologyEx(found.astype(np.uint8), cv2.MORPH_OPEN, _KERNEL).astype(np.bool_)
+
+    @property
+    def possible(self) -> Mask:
+        """Cells where the surface is, or may be."""
+        return self.hidden | self.known
 
     def hits(self, look: _Look) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
         """Row and column of the cell, and z-depth, where pixels (h, w) meet it; -1 beside it."""
@@ -656,7 +667,7 @@ def _choose(sheets: Sequence[_Sheet], looks: Sequence[_Look]) -> None:
         for sheet, won, no in zip(sheets, wins, refused, strict=True):
             # Views sample far cells sparsely.
             joined = cv2.morphologyEx(won.astype(np.uint8), cv2.MORPH_CLOSE, _KERNEL)
-            hole = joined.astype(np.bool_) & sheet.hidden
+            hole = joined.astype(np.bool_) & sheet.possible
             sheet.hole = np.zeros_like(hole)
             for part in _components(hole & ~no):
                 if _is_surrounded(sheet, part):
@@ -681,7 +692,7 @@ def _claim(
         may = look.thing & (row >= 0)
         may &= look.heights(sheet.plane, look.before) > -sheet.thickness
         may &= look.heights(sheet.plane, look.after) < -sheet.thickness
-        may &= (sheet.hidden & ~refused[number])[row, column]
+        may &= (sheet.possible & ~refused[number])[row, column]
         nearer = may & (depth < best)
         best[nearer], which[nearer] = depth[nearer], number
     for number, (row, column) in enumerate(cells):
@@ -702,7 +713,7 @@ def _is_surrounded(sheet: _Sheet, part: Mask) -> bool:
 
     And not empty space, as beyond the edge of a table. No surface goes on further than it was seen.
     """
-    known = sheet.known & (sheet.seen >= sheet.free)
+    known = sheet.known
     observed = known | (sheet.free >= _FREE_VIEWS)
     if int(known.sum()) < int(part.sum()):
         return False
