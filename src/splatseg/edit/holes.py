@@ -15,7 +15,7 @@ References:
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import cv2
 import numpy as np
@@ -26,63 +26,43 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from splatseg._check import check_shape
-from splatseg.core import Camera, Gaussians, Labels, Layer, Selection, View, apply_rows
+from splatseg.core import Camera, Features, Gaussians, Labels, Layer, Selection, View, apply_rows
 from splatseg.core.boundary import boundary
 from splatseg.core.edited import NEW, Edited
 from splatseg.core.instance_tree import InstanceTree
 from splatseg.core.models import Inpainting
 from splatseg.core.rigid import quaternion_from_rotation
 from splatseg.core.sh import SH_C0
+from splatseg.edit.planes import (
+    FREE_VIEWS,
+    KERNEL,
+    MARGIN,
+    THICKNESS,
+    Look,
+    Mask,
+    Removal,
+    Sheet,
+    dot,
+    find_planes,
+    pixels_of,
+    rim_cameras,
+    rim_points,
+    sheet_of,
+    small_camera,
+)
 from splatseg.errors import InputError
 from splatseg.models import find_model
-from splatseg.neighbours import NeighbourIndex
-from splatseg.render import Rendered, back_project, render
-from splatseg.render.warp import undistorted_camera
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from splatseg.render import back_project
 
 OPENCV = "opencv"
 """Name of the inpainter that needs no weights."""
 
-_LONGEST = 640
-"""Longest side of the views as they are rendered here, pixels: cells are no finer than that."""
-
-_MOST_VIEWS, _RIM_VIEWS = 96, 16
-"""Views that may look through a plane, and views of the thing that give points and claim cells."""
-
-_RIM_POINTS = 2000
-"""Points of each of these."""
-
-_SAMPLES, _NEAREST = 512, 48
-"""Hypotheses of a plane, and the points of each: a patch of that many nearest points."""
-
-_PLANES = 10
-_MIN_INLIERS = 0.02
-"""Most planes, and the least share of all points that one must have."""
-
-_THICKNESS = 4.0
-"""Distance from a plane, in pixels of the views, at which a point is still on it: fits of 512 x
-384 photographs scatter centres by about one."""
-
-_FAR = 20.0
-"""Distance of the camera above a plane, in its longest sides: nearly parallel projection."""
-
-_MARGIN = 16
-"""Cells around a hole that are drawn for the inpainting, half of them for labels."""
-
-_MOST_CELLS = 384
-"""Longest side of a plane's image."""
-
-_SEEN = 0.5
-"""Weight of the thing above which a pixel is its."""
+_MOST_VIEWS = 96
+"""Views that may look through a plane."""
 
 _SUPPORT, _MIN_VISIBILITY, _EXPOSED_ROUNDS = 0.2, 1.0, 2
 """Share of what views see of a Gaussian after a removal that they must have seen before, the least
 that they see after it, in pixels, and how often this is asked."""
-
-_FREE_VIEWS = 2
-"""Views that must look through a cell before it counts as empty: depths err along outlines."""
 
 _MIN_CELLS, _ROUNDS = 12, 4
 """Least cells of a hole, and rounds in which pixels that were given to refused holes go to what
@@ -91,9 +71,6 @@ is behind."""
 _OPACITY, _SPREAD, _FLATNESS = 0.9, 0.6, 0.1
 """Opacity of a new Gaussian, and its standard deviations along and across the plane in cells:
 together they let less than a hundredth through and blur by less than a pixel."""
-
-_KERNEL = np.ones((5, 5), np.uint8)
-"""Cells that are taken together where single ones err."""
 
 _RADIUS = 5.0
 """Pixels around a pixel that Telea's method asks."""
@@ -180,17 +157,17 @@ def fill(
     """
     if not views:
         raise InputError("views: expected at least one, got none.")
-    cameras = [_camera(view) for view in _spaced(views)]
-    scene = _Removal(gaussians, removed, backend)
-    rim = _rim_cameras(scene, cameras)
+    cameras = [small_camera(view) for view in _spaced(views)]
+    scene = Removal(gaussians, removed, backend)
+    rim = rim_cameras(scene, cameras)
     if not rim:
         return _none(gaussians)
     looks = [scene.look(camera) for camera in rim]
-    points, pixel = _rim_points(looks)
+    points, pixel = rim_points(looks)
     sheets = [
         sheet
-        for plane in _planes(points, _THICKNESS * pixel)
-        if (sheet := _sheet(plane, looks, pixel)) is not None
+        for plane in find_planes(points, THICKNESS * pixel)
+        if (sheet := sheet_of(plane, looks, pixel)) is not None
     ]
     for done, camera in enumerate(cameras, start=1):
         look = scene.look(camera)
@@ -228,7 +205,7 @@ def exposed(
     Returns:
         The Gaussians; none of them is removed already.
     """
-    cameras = [_camera(view) for view in _spaced(views)]
+    cameras = [small_camera(view) for view in _spaced(views)]
     everything = torch.ones(len(gaussians), dtype=torch.bool)
     before = _visibility(gaussians, everything, cameras, backend)
     gone = removed.mask.cpu()
@@ -294,10 +271,12 @@ def _typical(layer: Layer, rim: Tensor) -> int:
             values = layer.ids[rim].long()
         case Selection():
             values = layer.mask[rim].long()
-        case _:
+        case Features():
             rows = layer.values[rim].double()
             away = ((rows - rows.mean(dim=0)) ** 2).sum(dim=1)
             return int(rim[int(away.argmin())])
+        case _:
+            return int(rim[0])
     found, counts = torch.unique(values, return_counts=True)
     most = found[int(counts.argmax())]
     return int(rim[int((values == most).int().argmax())])
@@ -307,356 +286,10 @@ def _none(gaussians: Gaussians) -> Filled:
     return Filled(gaussians=gaussians[:0], holes=torch.zeros(0, dtype=torch.int64), rims=())
 
 
-# What views show.
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Look:
-    """What a view showed before the removal and shows after it."""
-
-    camera: Camera
-    centre: Array
-    rays: Array
-    """World directions of the pixels, with 1 along the optical axis, (h, w, 3)."""
-
-    thing: Mask
-    """Pixels of the thing, (h, w)."""
-
-    before: Array
-    """z-depth of the surface, (h, w); infinite where there is none."""
-
-    after: Array
-    image: Array
-    """Colours after the removal, (h, w, 3) in [0, 1]."""
-
-    def points(self, depth: Array) -> Array:
-        """Points at z-depths (h, w) or (n,) with rays alike."""
-        return self.centre + self.rays * depth[..., None]
-
-    def heights(self, plane: "_Plane", depth: Array) -> Array:
-        """Signed distances of points at z-depths, positive on the camera's side of the plane."""
-        own = _dot(self.centre, plane.normal) - plane.offset
-        slope = _dot(self.rays, plane.normal)
-        with np.errstate(invalid="ignore"):
-            found = own + slope * depth
-        # Nothing at all is beyond any plane.
-        found = np.where(np.isfinite(depth), found, -np.inf * np.sign(own))
-        return found * np.sign(own)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Removal:
-    """A scene and what is taken out of it."""
-
-    gaussians: Gaussians
-    removed: Selection
-    backend: str
-
-    @property
-    def stays(self) -> Gaussians:
-        return self.gaussians[~self.removed.mask]
-
-    def weight(self, camera: Camera) -> Rendered:
-        """The thing's share of each pixel."""
-        signal = self.removed.mask.to(self.gaussians.means)[:, None]
-        return render(self.gaussians, camera, signal, backend=self.backend)
-
-    def look(self, camera: Camera) -> _Look:
-        with torch.no_grad():
-            drawn = self.weight(camera)
-            left = render(self.stays, camera, backend=self.backend)
-        ones = torch.ones(camera.height, camera.width, dtype=torch.float64)
-        world = camera.unproject(camera.pixel_centres().double(), ones).numpy()
-        centre = camera.centre.double().numpy()
-        return _Look(
-            camera=camera,
-            centre=centre,
-            rays=world - centre,
-            thing=(drawn.image[..., 0] > _SEEN).cpu().numpy(),
-            before=_surface(drawn.median_depth),
-            after=_surface(left.median_depth),
-            image=_colours(left),
-        )
-
-
-def _colours(drawn: Rendered) -> Array:
-    """Colours without the black behind what is not quite opaque."""
-    alpha = drawn.alpha.clamp_min(_SEEN)[..., None]
-    return (drawn.image / alpha).clamp(0, 1).cpu().double().numpy()
-
-
-def _surface(depth: Tensor) -> Array:
-    found = depth.cpu().double().numpy()
-    return np.where(found > 0, found, np.inf)
-
-
-def _camera(view: View) -> Camera:
-    """The pinhole camera of a view, not larger than needed."""
-    camera = undistorted_camera(view.camera)
-    share = min(1.0, _LONGEST / max(camera.width, camera.height))
-    if share == 1:
-        return camera
-    return camera.resized(max(1, round(share * camera.width)), max(1, round(share * camera.height)))
-
-
-def _rim_cameras(scene: _Removal, cameras: Sequence[Camera]) -> list[Camera]:
-    """Cameras that see the thing, evenly chosen."""
-    shown: list[Camera] = []
-    for camera in cameras:
-        small = camera.resized(max(1, camera.width // 4), max(1, camera.height // 4))
-        with torch.no_grad():
-            if bool((scene.weight(small).image > _SEEN).any()):
-                shown.append(camera)
-    return shown[:: -(-len(shown) // _RIM_VIEWS)] if shown else []
-
-
-def _rim_points(looks: Sequence[_Look]) -> tuple[Array, float]:
-    """Surface points around and behind the thing, (n, 3), and the size of a pixel there."""
-    found: list[Array] = []
-    sizes: list[Array] = []
-    for look in looks:
-        # As far around the thing as it is wide.
-        reach = max(4, round(float(np.sqrt(look.thing.sum())) / 2))
-        kernel = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
-        near = cv2.dilate(look.thing.astype(np.uint8), kernel).astype(np.bool_)
-        near &= np.isfinite(look.after)
-        index = np.flatnonzero(near)
-        index = index[:: max(1, -(-len(index) // _RIM_POINTS))]
-        depth = look.after.reshape(-1)[index]
-        found.append(look.centre + look.rays.reshape(-1, 3)[index] * depth[:, None])
-        sizes.append(look.before[look.thing] / look.camera.fx)
-    sizes_all = np.concatenate(sizes)
-    sizes_all = sizes_all[np.isfinite(sizes_all)]
-    return np.concatenate(found), float(np.median(sizes_all)) if len(sizes_all) else 0.0
-
-
-# Planes.
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Plane:
-    """Points x with normal . x = offset, and those of them that were seen."""
-
-    normal: Array
-    offset: float
-    points: Array
-
-
-def _dot(points: Array, vector: Array) -> Array:
-    """Products without BLAS, whose sums depend on the number of threads."""
-    return points[..., 0] * vector[0] + points[..., 1] * vector[1] + points[..., 2] * vector[2]
-
-
-def _fitted(points: Array) -> tuple[Array, float]:
-    """The plane of least squares through points (n, 3), n >= 3."""
-    mean = points.mean(axis=0)
-    away = points - mean
-    spread = np.array([[(away[:, i] * away[:, j]).mean() for j in range(3)] for i in range(3)])
-    normal = np.linalg.eigh(spread)[1][:, 0]
-    return normal, float(_dot(mean, normal))
-
-
-def _planes(points: Array, thickness: float) -> list[_Plane]:
-    """Planes through most of the points, one after another from those that are left."""
-    found: list[_Plane] = []
-    rest = points
-    least = max(_NEAREST, round(_MIN_INLIERS * len(points)))
-    while len(found) < _PLANES and len(rest) >= least:
-        index = NeighbourIndex(torch.from_numpy(rest))
-        first = np.unique(np.linspace(0, len(rest) - 1, _SAMPLES).round().astype(np.int64))
-        near = index.nearest(torch.from_numpy(rest[first]), _NEAREST).indices.numpy()
-        best, inside = 0, np.zeros(len(rest), np.bool_)
-        for patch in near:
-            normal, offset = _fitted(rest[patch])
-            close = np.abs(_dot(rest, normal) - offset) < thickness
-            count = int(close.sum())
-            if count > best:
-                best, inside = count, close
-        if best < least:
-            break
-        for _ in range(3):
-            normal, offset = _fitted(rest[inside])
-            inside = np.abs(_dot(rest, normal) - offset) < thickness
-            if int(inside.sum()) < least:
-                break
-        else:
-            found.append(_Plane(normal, offset, rest[inside]))
-        # What lies a little further off is of the same surface and makes no plane of its own.
-        rest = rest[np.abs(_dot(rest, normal) - offset) >= 2 * thickness]
-    return found
-
-
-# The images of planes.
-
-
-@dataclass(slots=True, eq=False)
-class _Sheet:
-    """A part of a plane in square cells, as a camera straight above it sees it."""
-
-    plane: _Plane
-    camera: Camera
-    size: float
-    """Side of a cell, scene units."""
-
-    thickness: float
-    centres: Array
-    """World points of the cells, (rows, columns, 3)."""
-
-    colours: Array
-    """Colours that views show there, weighted and summed, (rows, columns, 3)."""
-
-    weights: Array
-    """Sum of these weights, (rows, columns)."""
-
-    free: NDArray[np.int32]
-    """Views that look through each cell."""
-
-    seen: NDArray[np.int32]
-    """Views in which the surface is there."""
-
-    hole: Mask
-    """What is to be filled."""
-
-    def observe(self, look: _Look) -> None:
-        """Count a view: where it looks through the plane, where it shows it, and how."""
-        row, column, inside = _pixels(look.camera, self.centres)
-        height = look.heights(self.plane, look.before)[row, column]
-        self.free += inside & (height < -self.thickness)
-        seen = inside & (np.abs(height) <= self.thickness) & ~look.thing[row, column]
-        self.seen += seen
-        # Straight and near views show most: pixels of a cell go as cosine over squared distance.
-        ray = self.centres - look.centre
-        squared = _dot(ray, self.plane.normal) ** 2
-        weight = seen * squared / (ray**2).sum(axis=-1) ** 3
-        self.weights += weight
-        self.colours += weight[..., None] * look.image[row, column]
-
-    @property
-    def known(self) -> Mask:
-        """Cells that views saw."""
-        return (self.seen >= np.maximum(self.free, _FREE_VIEWS)) & (self.weights > 0)
-
-    @property
-    def image(self) -> Array:
-        """What views show of the plane, (rows, columns, 3) in [0, 1]; black where they do not."""
-        return self.colours / np.where(self.weights > 0, self.weights, 1.0)[..., None]
-
-    @property
-    def hidden(self) -> Mask:
-        """Cells that no view saw or looked through."""
-        found = (self.free < _FREE_VIEWS) & (self.seen < _FREE_VIEWS)
-        # Depths of faint texture err here and there.
-        return cv2.morphologyEx(found.astype(np.uint8), cv2.MORPH_OPEN, _KERNEL).astype(np.bool_)
-
-    @property
-    def possible(self) -> Mask:
-        """Cells where the surface is, or may be."""
-        return self.hidden | self.known
-
-    def hits(self, look: _Look) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
-        """Row and column of the cell, and z-depth, where pixels (h, w) meet it; -1 beside it."""
-        own = _dot(look.centre, self.plane.normal) - self.plane.offset
-        slope = _dot(look.rays, self.plane.normal)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            depth = -own / slope
-        depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.inf)
-        points = look.points(np.where(np.isfinite(depth), depth, 0.0))
-        row, column, inside = _pixels(self.camera, points)
-        inside &= np.isfinite(depth)
-        return np.where(inside, row, -1), np.where(inside, column, -1), depth
-
-
-def _pixels(camera: Camera, points: Array) -> tuple[NDArray[np.int64], NDArray[np.int64], Mask]:
-    """Row and column of the pixel that shows each point, and whether one does."""
-    pose = camera.cam_from_world.double().numpy()
-    x, y, z = (_dot(points, pose[i, :3]) + pose[i, 3] for i in range(3))
-    ahead = z > 0
-    z = np.where(ahead, z, 1.0)
-    column = np.floor(camera.fx * x / z + camera.cx)
-    row = np.floor(camera.fy * y / z + camera.cy)
-    inside = ahead & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-    row, column = (np.where(inside, value, 0).astype(np.int64) for value in (row, column))
-    return row, column, inside
-
-
-def _sheet(plane: _Plane, looks: Sequence[_Look], pixel: float) -> _Sheet | None:
-    """The part of a plane that the thing hid from some views; None where there is none."""
-    thickness = _THICKNESS * pixel
-    across = _across(plane.normal)
-    down = np.cross(-plane.normal, across)
-    axes = (across, down)
-    hidden: list[Array] = []
-    for look in looks:
-        slope = _dot(look.rays, plane.normal)
-        own = _dot(look.centre, plane.normal) - plane.offset
-        with np.errstate(divide="ignore", invalid="ignore"):
-            depth = -own / slope
-        open_to = look.heights(plane, look.after) < -thickness
-        behind = look.heights(plane, look.before) > -thickness
-        good = look.thing & open_to & behind & np.isfinite(depth) & (depth > 0)
-        hidden.append(look.centre + look.rays[good] * depth[good][:, None])
-    points = np.concatenate(hidden)
-    low, high = (
-        np.array([bound(_dot(plane.points, axis)) for axis in axes]) for bound in (np.min, np.max)
-    )
-    flat = np.stack([_dot(points, axis) for axis in axes], axis=1)
-    # A hole is among what was seen of the surface, not beyond it.
-    flat = flat[((flat >= low) & (flat <= high)).all(axis=1)]
-    if not len(flat):
-        return None
-    low, high = flat.min(axis=0), flat.max(axis=0)
-    size = max(pixel, float((high - low).max()) / (_MOST_CELLS - 2 * _MARGIN))
-    columns, rows = (int(n) for n in np.ceil((high - low) / size).astype(int) + 2 * _MARGIN)
-    camera = _above(plane, axes, (low + high) / 2, (columns, rows), size)
-    at = camera.pixel_centres().double()
-    reach = torch.full(at.shape[:-1], camera.fx * size, dtype=torch.float64)
-    centres = camera.unproject(at, reach).numpy()
-    return _Sheet(
-        plane=plane,
-        camera=camera,
-        size=size,
-        thickness=thickness,
-        centres=centres,
-        colours=np.zeros((rows, columns, 3)),
-        weights=np.zeros((rows, columns)),
-        free=np.zeros((rows, columns), np.int32),
-        seen=np.zeros((rows, columns), np.int32),
-        hole=np.zeros((rows, columns), np.bool_),
-    )
-
-
-def _across(normal: Array) -> Array:
-    """A unit vector in the plane: along the axis that is nearest to lying in it."""
-    axis = np.eye(3)[int(np.abs(normal).argmin())]
-    found = axis - normal * float(_dot(axis, normal))
-    return found / np.sqrt(float(_dot(found, found)))
-
-
-def _above(
-    plane: _Plane, axes: tuple[Array, Array], middle: Array, cells: tuple[int, int], size: float
-) -> Camera:
-    """A camera far above the middle of a sheet, whose pixels are cells of this size on it."""
-    rotation = np.stack((*axes, -plane.normal))
-    distance = _FAR * max(cells) * size
-    centre = axes[0] * middle[0] + axes[1] * middle[1] + plane.normal * (plane.offset + distance)
-    pose = np.eye(4)
-    pose[:3, :3] = rotation
-    pose[:3, 3] = [-float(_dot(centre, axis)) for axis in rotation]
-    return Camera(
-        width=cells[0],
-        height=cells[1],
-        fx=distance / size,
-        fy=distance / size,
-        cx=cells[0] / 2,
-        cy=cells[1] / 2,
-        cam_from_world=torch.from_numpy(pose),
-    )
-
-
 # What is filled, and with what.
 
 
-def _choose(sheets: Sequence[_Sheet], looks: Sequence[_Look]) -> None:
+def _choose(sheets: Sequence[Sheet], looks: Sequence[Look]) -> None:
     """Mark the cells to fill: what each pixel of the thing should show now, nearest first."""
     refused = [np.zeros_like(sheet.hole) for sheet in sheets]
     for _ in range(_ROUNDS):
@@ -666,7 +299,7 @@ def _choose(sheets: Sequence[_Sheet], looks: Sequence[_Look]) -> None:
         again = False
         for sheet, won, no in zip(sheets, wins, refused, strict=True):
             # Views sample far cells sparsely.
-            joined = cv2.morphologyEx(won.astype(np.uint8), cv2.MORPH_CLOSE, _KERNEL)
+            joined = cv2.morphologyEx(won.astype(np.uint8), cv2.MORPH_CLOSE, KERNEL)
             hole = joined.astype(np.bool_) & sheet.possible
             sheet.hole = np.zeros_like(hole)
             for part in _components(hole & ~no):
@@ -680,7 +313,7 @@ def _choose(sheets: Sequence[_Sheet], looks: Sequence[_Look]) -> None:
 
 
 def _claim(
-    sheets: Sequence[_Sheet], look: _Look, wins: Sequence[Mask], refused: Sequence[Mask]
+    sheets: Sequence[Sheet], look: Look, wins: Sequence[Mask], refused: Sequence[Mask]
 ) -> None:
     """Of one view, give each pixel of the thing to the nearest cell that may be there."""
     best = np.full(look.thing.shape, np.inf)
@@ -708,21 +341,25 @@ def _components(mask: Mask) -> Iterator[Mask]:
             yield part
 
 
-def _is_surrounded(sheet: _Sheet, part: Mask) -> bool:
+def _is_surrounded(sheet: Sheet, part: Mask) -> bool:
     """Whether most cells of a hole have seen surface as the nearest that is not hidden.
 
     And not empty space, as beyond the edge of a table. No surface goes on further than it was seen.
     """
     known = sheet.known
-    observed = known | (sheet.free >= _FREE_VIEWS)
+    observed = known | (sheet.free >= FREE_VIEWS)
     if int(known.sum()) < int(part.sum()):
         return False
-    rows, columns = distance_transform_edt(~observed, return_distances=False, return_indices=True)
+    nearest = cast(
+        "NDArray[np.int64]",
+        distance_transform_edt(~observed, return_distances=False, return_indices=True),
+    )
+    rows, columns = nearest
     return bool(known[rows[part], columns[part]].mean() > 0.5)
 
 
 def _holes_filled(
-    sheet: _Sheet, scene: _Removal, inpainter: Inpainting
+    sheet: Sheet, scene: Removal, inpainter: Inpainting
 ) -> Iterator[tuple[Gaussians, Tensor]]:
     """New Gaussians for each hole of a sheet, and the rows around it."""
     if not sheet.hole.any():
@@ -733,16 +370,16 @@ def _holes_filled(
     colours = painted.double() / 255
     stays = scene.stays
     means = stays.means.double().cpu().numpy()
-    row, column, inside = _pixels(sheet.camera, means)
-    inside &= np.abs(_dot(means, sheet.plane.normal) - sheet.plane.offset) < sheet.thickness
+    row, column, inside = pixels_of(sheet.camera, means)
+    inside &= np.abs(dot(means, sheet.plane.normal) - sheet.plane.offset) < sheet.thickness
     for part in _components(sheet.hole):
-        kernel = np.ones((_MARGIN + 1, _MARGIN + 1), np.uint8)
+        kernel = np.ones((MARGIN + 1, MARGIN + 1), np.uint8)
         around = cv2.dilate(part.astype(np.uint8), kernel).astype(np.bool_)
         rim = torch.from_numpy(np.flatnonzero(inside & around[row, column]))
         yield _new_gaussians(sheet, part, colours, stays), rim
 
 
-def _new_gaussians(sheet: _Sheet, part: Mask, colours: Tensor, like: Gaussians) -> Gaussians:
+def _new_gaussians(sheet: Sheet, part: Mask, colours: Tensor, like: Gaussians) -> Gaussians:
     """One flat Gaussian a cell."""
     chosen = torch.from_numpy(part)
     means = torch.from_numpy(sheet.centres)[chosen].to(like.means)
