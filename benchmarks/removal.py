@@ -8,8 +8,8 @@ A layer `things` that SCENE holds is taken as it is, made for instance by ``spla
 
 Things are selected by lifting the truth masks of the training views (`uplift`) and removed, one
 after the other, each from the whole scene. Gaussians that straddle a boundary are split before:
-`each` at the thing's own masks as `splatseg edit --remove` does it, three passes a thing; `off`
-nowhere.
+`each` at the thing's own masks as `splatseg edit --remove` does it, three passes a thing, with
+`--refit` as well; `off` nowhere.
 
 - left: the blending weight W'm of the thing's training masks m that falls on Gaussians which are
   not removed, as a share of all of it. Pixels at the border of a mask show both sides, in the
@@ -189,7 +189,12 @@ def together(document: Document, things: dict[int, str], truth: Evidence, thin: 
 
 
 def one_by_one(
-    document: Document, things: dict[int, str], truth: Evidence, cut: CutOptions, thin: int
+    document: Document,
+    things: dict[int, str],
+    truth: Evidence,
+    cut: CutOptions,
+    thin: int,
+    refit: int,
 ):
     """Each thing as the command edit does it."""
     scene = document.scene
@@ -200,6 +205,7 @@ def one_by_one(
             kind="remove",
             where=Where(layer=LAYER, ids=(thing,)),
             cut=CutBy(by="masks", evidence=FOLDER, views=names, options=cut),
+            refit=refit or None,
         )
         ready = prepare(document, operation)
         gaussians, chosen = ready.document.scene.gaussians, ready.selection
@@ -271,6 +277,7 @@ def main() -> None:
     )
     parser.add_argument("--keep-share", type=float, default=CutOptions().keep_share)
     parser.add_argument("--min-side", type=float, default=CutOptions().min_side)
+    parser.add_argument("--refit", type=int, default=0, help="steps, with --split each")
     args = parser.parse_args()
     started = time.perf_counter()
     document = load_document(args.scene, data=args.data)
@@ -284,7 +291,7 @@ def main() -> None:
         things = {thing: name for thing, name in things.items() if thing in args.ids}
     cut = CutOptions(keep_share=args.keep_share, min_side=args.min_side)
     if args.split == "each":
-        removed = one_by_one(document, things, truth, cut, args.thin)
+        removed = one_by_one(document, things, truth, cut, args.thin, args.refit)
     else:
         removed = together(document, things, truth, args.thin)
     found: list[Removed] = []

@@ -247,6 +247,16 @@ def test_scenes_are_joined(room, tmp_path) -> None:
         (["--scale", "0"], "scale: expected more than 0"),
         (["--move", "nan", "0", "0"], "translation: 1 of 3 values are not finite"),
         (["--colour", "2", "0", "0"], "colour: expected values in [0, 1]"),
+        (["--extract", "--layer", "objects", "--ids", "3", "--fill", "opencv"], "--fill: go with"),
+        (["--move", "1", "0", "0", "--refit", "9"], "--fill: go with --remove only"),
+        (
+            ["--remove", "--layer", "objects", "--ids", "3", "--fill", "classical"],
+            "fill: expected opencv or a model that inpaints, classical does not",
+        ),
+        (
+            ["--remove", "--layer", "objects", "--ids", "3", "--cut", "off", "--refit", "9"],
+            "refit: expected a photograph that shows what is removed, got none",
+        ),
         (["--undo"], "expected a scene with an edit to undo, got one without"),
         (["--merge", "nowhere"], "nowhere: expected a scene folder, got none"),
         (["--merge", "nowhere", "--colour", "1", "0", "0"], "--merge: takes no colours"),
@@ -420,3 +430,16 @@ def test_specks_go_along(room, tmp_path, capsys) -> None:
     assert run(tmp_path / "twice", tmp_path / "again", "--undo") == 0
     again = load_scene(tmp_path / "again").gaussians
     assert torch.equal(again.means, left), "undo does it again, specks included"
+
+
+def test_what_was_hidden_is_filled(room, tmp_path, capsys) -> None:
+    thing = ["--remove", "--layer", "objects", "--ids", 3, "--cut", "off", "--pictures", 0]
+    assert run(room, tmp_path / "out", *thing, "--fill", "opencv") == 0
+    (edit,) = history(tmp_path / "out")
+    assert edit["fill"] == {"views": ["v0", "v1", "v2"], "inpainter": "opencv"}
+    counts = edit["result"]
+    scene = load_scene(tmp_path / "out")
+    assert len(scene.gaussians) == counts["after"]
+    assert len(load_scene_layer(tmp_path / "out", "objects")) == counts["after"]
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"filled with {counts['filled']} Gaussians what was hidden" in said

@@ -53,6 +53,8 @@ QUICK = FitOptions(minutes=None, steps=6, max_gaussians=300)
         (EditOptions, {"scale": 2.0, "ids": (1,)}, "ids, names: expected `layer`"),
         (EditOptions, {"scale": 2.0, "invert": True}, "invert: expected `layer`"),
         (EditOptions, {"scale": 2.0, "specks": -1}, "specks: expected at least 0"),
+        (EditOptions, {"scale": 2.0, "refit": 3}, "refit, fill: go with `remove` only"),
+        (EditOptions, {"undo": True, "fill": "opencv"}, "refit, fill: go with `remove` only"),
         (EditOptions, {"measure": 4}, "measure: this option was removed; pictures=0"),
     ],
 )

@@ -303,6 +303,15 @@ class DenseDepth(Model, Protocol):
 
 
 @runtime_checkable
+class Inpainting(Model, Protocol):
+    """Paints what is missing in an image from what is around it."""
+
+    def inpaint(self, image: Image, mask: Bool[Tensor, "height width"]) -> Image:
+        """The image, painted where the mask is True; what it shows there is not to be used."""
+        ...
+
+
+@runtime_checkable
 class TextFeatures(Model, Protocol):
     """Embeds image patches and words in one space; compare by cosine."""
 

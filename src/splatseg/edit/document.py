@@ -11,7 +11,7 @@ import torch
 from splatseg.core import Edited, Layer, Scene, Similarity, apply_rows
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.json_values import plain_object
-from splatseg.core.options import Natural
+from splatseg.core.options import Count, Natural
 from splatseg.errors import InputError, ShapeError
 from splatseg.io.atomic import is_vacant
 from splatseg.io.scene import load_scene, load_scene_layer, save_scene, scene_layer_names
@@ -24,7 +24,7 @@ Kind = Literal["extract", "remove", "duplicate", "transform", "recolour", "merge
 
 _TAKES: dict[str, tuple[set[str], set[str]]] = {
     "extract": ({"where"}, {"cut"}),
-    "remove": ({"where"}, {"cut", "specks"}),
+    "remove": ({"where"}, {"cut", "specks", "refit", "fill"}),
     "split": ({"where", "cut"}, set()),
     "duplicate": ({"where", "transform"}, {"cut"}),
     "transform": ({"transform"}, {"where", "cut"}),
@@ -53,6 +53,17 @@ class CutBy:
 
     options: CutOptions = field(default_factory=CutOptions)
     """Which Gaussians are split, and how."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FillBy:
+    """How surfaces that a removed thing hid are continued."""
+
+    views: tuple[str, ...]
+    """Names of the views that saw the scene."""
+
+    inpainter: str = "opencv"
+    """Name of the model that paints them, see `find_inpainter`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,15 +105,19 @@ class Operation:
     """Most Gaussians of a piece that goes along because it touches nothing but what is removed;
     None leaves all pieces."""
 
+    refit: Count | None = None
+    """Steps of a fit that makes what is removed opaque and separate first; None leaves it out."""
+
+    fill: FillBy | None = None
+    """How what it hid is completed; None leaves holes."""
+
     def __post_init__(self) -> None:
         convert_fields(self)
         if self.kind not in _TAKES:
             raise InputError(f"operation: expected one of {', '.join(_TAKES)}, got {self.kind!r}.")
         must, may = _TAKES[self.kind]
         given = {
-            name
-            for name in ("where", "transform", "recolour", "other", "cut", "specks")
-            if getattr(self, name) is not None
+            name for name in [f.name for f in fields(self)][1:] if getattr(self, name) is not None
         }
         for name in sorted(must - given):
             raise InputError(f"{self.kind}: expected {name}, got none.")
@@ -130,6 +145,8 @@ class Operation:
             "other": self.other,
             "cut": self.cut and plain_object("cut", asdict(self.cut)),
             "specks": self.specks,
+            "refit": self.refit,
+            "fill": self.fill and plain_object("fill", asdict(self.fill)),
         }
         return {name: value for name, value in content.items() if value is not None}
 
@@ -153,6 +170,8 @@ class Operation:
             other=record.other,
             cut=record.cut,
             specks=record.specks,
+            refit=record.refit,
+            fill=record.fill,
         )
 
 
@@ -215,6 +234,8 @@ class _Record:
     other: str | None = None
     cut: CutBy | None = None
     specks: int | None = None
+    refit: int | None = None
+    fill: FillBy | None = None
 
 
 # A scene with its layers, which edits change together.

@@ -13,7 +13,8 @@ import torch
 
 from splatseg.core import Edited, Gaussians, Scene, Selection, Similarity, View
 from splatseg.core.boundary import boundary
-from splatseg.edit.document import HISTORY, Document, Operation, Recolour, load_document
+from splatseg.edit.document import HISTORY, Document, FillBy, Operation, Recolour, load_document
+from splatseg.edit.holes import exposed, fill, filled_layer, find_inpainter
 from splatseg.edit.operations import (
     duplicate,
     extract,
@@ -56,6 +57,7 @@ def apply(
     ready = prepared or prepare(document, operation, backend=backend, progress=progress)
     now, chosen = ready.document, ready.selection
     scene = now.scene
+    counts: dict[str, int] = {}
     match operation.kind:
         case "split":
             after = now
@@ -63,6 +65,8 @@ def apply(
             after = _merged(now, load_document(operation.other or ""), operation.transform)
         case "transform" if chosen is None:
             after = replace(now, scene=_moved_scene(scene, cast("Similarity", operation.transform)))
+        case "remove" if operation.fill is not None and chosen is not None:
+            after, counts = _removed_and_filled(now, chosen, operation.fill, (backend, progress))
         case _:
             after = now.edited(_edited(scene.gaussians, chosen, operation))
     result = {
@@ -70,6 +74,7 @@ def apply(
         "after": len(after.scene.gaussians),
         "split": ready.split,
         "added": len(now.scene.gaussians) - len(document.scene.gaussians),
+        **counts,
     }
     if operation.specks is not None:
         result["specks"] = ready.specks
@@ -93,6 +98,32 @@ def _edited(gaussians: Gaussians, chosen: Selection | None, operation: Operation
         case _:
             how = cast("Recolour", operation.recolour)
             return recolour(gaussians, chosen, **asdict(how))
+
+
+def _removed_and_filled(
+    document: Document, removed: Selection, by: FillBy, how: tuple[str, Progress | None]
+) -> tuple[Document, dict[str, int]]:
+    """Take something out, and continue behind it what it hid; what was counted by its name."""
+    backend, progress = how
+    gaussians = document.scene.gaussians
+    views = [document.scene.view(name) for name in by.views]
+    uncertain = exposed(gaussians, removed, views, backend=backend)
+    removed = removed | uncertain
+    found = fill(
+        gaussians,
+        removed,
+        views,
+        inpainter=find_inpainter(by.inpainter),
+        backend=backend,
+        progress=progress,
+    )
+    after = document.edited(remove(gaussians, removed))
+    joined = Gaussians.concatenate([after.scene.gaussians, found.gaussians])
+    filled = Document(
+        scene=replace(after.scene, gaussians=joined),
+        layers={name: filled_layer(layer, found, joined) for name, layer in after.layers.items()},
+    )
+    return filled, {"exposed": uncertain.count, "filled": len(found.gaussians)}
 
 
 def _merged(document: Document, other: Document, moved: Similarity | None) -> Document:

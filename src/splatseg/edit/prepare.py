@@ -20,6 +20,7 @@ from splatseg.core import (
 )
 from splatseg.core.boundary import boundary
 from splatseg.edit.document import CutBy, Document, Operation
+from splatseg.edit.refit import refit
 from splatseg.errors import InputError
 from splatseg.io.evidence import find_evidence, open_evidence
 from splatseg.lift import label_map
@@ -96,7 +97,51 @@ def prepare(
         ready = Prepared(document=document, selection=chosen, split=0)
     else:
         ready = _split_at(_Task(document, where, operation.cut, backend, progress))
-    return _with_specks(ready, where, operation.specks) if operation.specks else ready
+    if operation.specks:
+        ready = _with_specks(ready, where, operation.specks)
+    if operation.refit is not None:
+        ready = _refitted(ready, operation, operation.refit, (backend, progress))
+    return ready
+
+
+def _refitted(
+    ready: Prepared, operation: Operation, steps: int, how: tuple[str, Progress | None]
+) -> Prepared:
+    """With what is removed, and what is in its pixels, fitted further."""
+    backend, progress = how
+    document, chosen, where = ready.document, ready.selection, operation.where
+    if chosen is None or where is None:
+        return ready
+    if document.history:
+        raise InputError("refit: the photographs show the scene before it was edited.")
+    scene, cut = document.scene, operation.cut
+    if cut is not None and cut.by == "masks":
+        views = [scene.view(name) for name in cut.views]
+        masks, ids = _boundary(_Task(document, where, cut, backend, progress), chosen, views)
+    else:
+        views = list(scene.train_views or scene.views)
+        masks, ids = _drawn(scene.gaussians, chosen, views, backend)
+    gaussians = refit(
+        scene.gaussians,
+        chosen,
+        views,
+        masks,
+        ids,
+        steps=steps,
+        provenance=scene.provenance,
+        backend=backend,
+        progress=progress,
+    )
+    scene = replace(scene, gaussians=gaussians)
+    return replace(ready, document=replace(document, scene=scene))
+
+
+def _drawn(
+    gaussians: Gaussians, selection: Selection, views: Sequence[View], backend: str
+) -> tuple[LabelSource, tuple[int, ...]]:
+    """Label maps that a selection draws, and its id in them."""
+    maps = {view.name: view for view in views}
+    return _Drawn(gaussians=gaussians, selection=selection, views=maps, backend=backend), (1,)
 
 
 def _with_specks(ready: Prepared, where: Where, most: int) -> Prepared:
@@ -204,9 +249,7 @@ def _boundary(
     """Label maps, and the ids in them that are inside."""
     scene, cut, ids = task.document.scene, task.cut, task.where.ids
     if cut.by == "layer":
-        maps = {view.name: view for view in views}
-        drawn = _Drawn(gaussians=scene.gaussians, selection=named, views=maps, backend=task.backend)
-        return drawn, (1,)
+        return _drawn(scene.gaussians, named, views, task.backend)
     if cut.evidence is None or not ids:
         raise InputError("cut: masks need the name of evidence, and ids of a layer of labels.")
     if any(edit.get("kind") in MOVES for edit in task.document.history):

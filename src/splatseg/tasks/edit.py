@@ -205,6 +205,13 @@ def _edited(
             observer.info(_split_sentence(operation, ready.split, measured))
             observer.info(_growth_sentence(added, len(document.scene.gaussians)))
         after = apply(document, operation, prepared=ready, backend=backend)
+        result = after.history[-1]["result"]
+        filled = {name: result[name] for name in ("exposed", "filled") if name in result}
+        if filled:
+            observer.info(
+                f"filled with {filled['filled']} Gaussians what was hidden; "
+                f"{filled['exposed']} that views hardly saw were removed as well"
+            )
         count = None if ready.selection is None else ready.selection.count
         if count is not None:
             specks = f", {ready.specks} of them specks" if ready.specks else ""
@@ -216,6 +223,7 @@ def _edited(
                 "specks": ready.specks,
                 "split": ready.split,
                 "added": added,
+                **filled,
                 **measured,
             }
         )

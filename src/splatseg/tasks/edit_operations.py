@@ -11,7 +11,7 @@ import torch
 from splatseg.core import Labels, LayerInfo, Similarity
 from splatseg.core.options import Natural
 from splatseg.core.options import options as options_class
-from splatseg.edit import CutBy, Document, Operation, Recolour
+from splatseg.edit import CutBy, Document, FillBy, Operation, Recolour, find_inpainter
 from splatseg.errors import InputError, MissingFileError
 from splatseg.evaluate import psnr, render_and_photograph
 from splatseg.io.evidence import find_evidence, open_evidence
@@ -131,6 +131,15 @@ class EditOptions:
     that touch only what is removed, unless they are most of another object of the layer. 0 keeps
     them."""
 
+    refit: Natural = 0
+    """With `remove`: steps of a fit on the photographs that makes what is removed opaque and
+    separate from what stays, before it is removed; 150 are a good number. 0 leaves it out."""
+
+    fill: str | None = None
+    """With `remove`: continue floors, walls and other planes to where only what is removed stood
+    before them, painted by this inpainter: opencv, or a model of another package. None leaves
+    holes."""
+
     pictures: Natural = 3
     """Number of views drawn before and after, those that change most, for reports/edit.html of the
     new scene. 0 draws none, and does not measure the change by the cut."""
@@ -142,6 +151,8 @@ class EditOptions:
             raise InputError(f"{action}: {_NOTHING_SELECTED}")
         if action in ("merge", "undo") and selecting:
             raise InputError(f"{action}: takes no selection.")
+        if action != "remove" and (self.refit or self.fill is not None):
+            raise InputError("refit, fill: go with `remove` only.")
         if action in ("remove", "undo") and self.moves:
             raise InputError(f"{action}: takes no `move`, `rotate` or `scale`.")
         if action in ("remove", "duplicate", "merge", "undo") and self.recolours:
@@ -331,7 +342,16 @@ def operations_of(
         kind: Literal["extract", "remove"] = "extract" if options.extract else "remove"
         of_things = options.layer is not None and not options.invert
         specks = (options.specks or None) if options.remove and of_things else None
-        found.append(Operation(kind=kind, where=where, cut=split_by, specks=specks))
+        found.append(
+            Operation(
+                kind=kind,
+                where=where,
+                cut=split_by,
+                specks=specks,
+                refit=options.refit or None,
+                fill=_fill(options, document),
+            )
+        )
     if options.duplicate:
         moved = _similarity(options, _median(document, where))
         return (Operation(kind="duplicate", where=where, transform=moved, cut=split_by),)
@@ -345,6 +365,17 @@ def operations_of(
         split = None if found else split_by
         found.append(Operation(kind="transform", where=where, transform=moved, cut=split))
     return tuple(found)
+
+
+def _fill(options: EditOptions, document: Document) -> FillBy | None:
+    """How what was hidden is continued."""
+    if options.fill is None:
+        return None
+    find_inpainter(options.fill)  # a wrong name is said before anything is computed
+    views = document.scene.train_views or document.scene.views
+    if not views:
+        raise InputError("fill: expected views that saw the scene, got none.")
+    return FillBy(views=tuple(view.name for view in views), inpainter=options.fill)
 
 
 def _median(document: Document, where: Where | None) -> torch.Tensor:
