@@ -252,3 +252,11 @@ def test_threads_and_blocks_change_nothing(rng, monkeypatch) -> None:
     monkeypatch.setattr("splatseg.lift.point_shapes._ROWS", 7)
     assert torch.equal(one, ShapeForest(given, trees=8, seed=4).shares(asked))
     assert not torch.equal(one, ShapeForest(given, trees=8, seed=5).shares(asked))
+
+
+def test_heights_count_from_the_lowest_of_a_column_and_of_those_around_it() -> None:
+    across = np.array([[0.5, 0.5], [0.6, 0.4], [1.5, 0.5], [3.5, 0.5]])
+    height = np.array([1.0, 3.0, 0.5, -4.0])
+    found = point_shapes._in_columns(across, height, 1.0)
+    # Above the lowest of nine columns, above the own lowest, below the own highest.
+    assert found.tolist() == [[0.5, 0, 2], [2.5, 2, 0], [0, 0, 0], [0, 0, 0]]

@@ -166,6 +166,15 @@ def test_quaternions_of_either_sign_are_the_same_path(rng) -> None:
         assert torch.allclose(overlap, torch.ones(20).double())
 
 
+def test_a_closed_path_over_a_square_is_the_same_after_a_quarter_turn() -> None:
+    corners = torch.tensor([[1.0, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0]]).double()
+    one_way = torch.eye(4).double()[:1].expand(4, 4)
+    keys = Poses(centres=corners, quaternions=one_way)
+    path = poses_along_spline(keys, frames=12, closed=True, unit=1.0).centres
+    quarter = torch.stack((-path[:, 1], path[:, 0], path[:, 2]), dim=1)
+    assert torch.allclose(path.roll(-3, 0), quarter, atol=1e-6)
+
+
 @pytest.mark.parametrize("focus", [None, 4.0])
 def test_an_ellipse_before_a_forward_facing_capture(rng, focus) -> None:
     eyes = np.stack(

@@ -39,6 +39,14 @@ def test_upright_box_of_a_turned_cuboid(make, degrees) -> None:
     assert box.volume == pytest.approx(48, rel=0.02)
 
 
+@pytest.mark.parametrize("length", [0.2, 7.0])
+def test_up_may_have_any_length(make, length) -> None:
+    gaussians = make(corners([4.0, 2.0, 6.0]) @ turn_about_z(20).T)
+    one, other = (oriented_box(gaussians, up=(0, 0, scale)) for scale in (1.0, length))
+    assert torch.allclose(one.size, other.size)
+    assert torch.allclose(one.rotation, other.rotation)
+
+
 def test_an_upright_box_stands_though_its_object_leans(make) -> None:
     """A leaning stick: pca follows it, upright does not."""
     t = torch.linspace(-1, 1, 101)
