@@ -4,6 +4,7 @@ from splatseg.lift.boundaries.cut import Cut as Cut
 from splatseg.lift.boundaries.cut import CutOptions as CutOptions
 from splatseg.lift.boundaries.cut import cut_box as cut_box
 from splatseg.lift.boundaries.cut import cut_masks as cut_masks
+from splatseg.lift.boundaries.objects import ObjectLabels as ObjectLabels
 from splatseg.lift.boundaries.sharpen import Sharpened as Sharpened
 from splatseg.lift.boundaries.sharpen import SharpenOptions as SharpenOptions
 from splatseg.lift.boundaries.sharpen import sharpen as sharpen
