@@ -45,6 +45,16 @@ def test_segments_of_all_kinds_take_the_ids_of_one_layer(
     assert len(labels.labels.unique()) > 2
 
 
+def test_label_maps_have_no_more_pixels_than_the_photographs_of_the_fit(
+    capture: Capture, tmp_path: Path
+) -> None:
+    for longest in (160, 1600):
+        labels = object_labels(
+            capture, "instance", scene=tmp_path, options=FitOptions(longest=longest), backend="cpu"
+        )
+        assert labels._evidence.label_map("train_0000").ids.shape[1] == min(longest, 320)
+
+
 def test_other_evidence_is_refused(capture: Capture, tmp_path: Path) -> None:
     for name, words in (
         ("features_dino", "expected label maps or segments of objects .* got features"),

@@ -23,6 +23,7 @@ from splatseg.lift.point_labels import PointRule as PointRule
 from splatseg.lift.point_labels import labels_of_points as labels_of_points
 from splatseg.lift.segments import EvidenceSegments as EvidenceSegments
 from splatseg.lift.segments import MatchedMaps as MatchedMaps
+from splatseg.lift.segments import ReducedMaps as ReducedMaps
 from splatseg.lift.vocabulary import TextSpace as TextSpace
 from splatseg.lift.vocabulary import relevancy as relevancy
 from splatseg.lift.voting.confusion import ConfusionOptions as ConfusionOptions

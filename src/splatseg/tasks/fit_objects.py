@@ -7,7 +7,7 @@ from splatseg.errors import InputError
 from splatseg.fit import FitOptions
 from splatseg.io.digests import digest, file_mark
 from splatseg.io.evidence import check_map_sizes, find_evidence, open_evidence
-from splatseg.lift import EvidenceSegments, MatchedMaps, ObjectLabels, complete
+from splatseg.lift import EvidenceSegments, MatchedMaps, ObjectLabels, ReducedMaps, complete
 from splatseg.methods.associate import associate
 
 
@@ -16,8 +16,9 @@ def object_labels(
 ) -> ObjectLabels:
     """What `fit` learns objects from.
 
-    Label maps count as they are. Segments (masks, panoptic maps, tracks) are associated on the
-    Gaussians as they are when labels are decided first, and take the ids of that layer.
+    Label maps count as they are, with no more pixels than the photographs of the fit. Segments
+    (masks, panoptic maps, tracks) are associated on the Gaussians as they are when labels are
+    decided first, and take the ids of that layer.
 
     Args:
         capture: The capture of the fit.
@@ -40,7 +41,8 @@ def object_labels(
     files = sorted(path for path in folder.rglob("*") if path.is_file())
     mark = digest((str(path.relative_to(folder)), file_mark(path)) for path in files)
     if evidence.kind == "labels":
-        return ObjectLabels(views, evidence, digest=mark, backend=backend)
+        maps = ReducedMaps(source=evidence, longest_side=options.longest)
+        return ObjectLabels(views, maps, digest=mark, backend=backend)
     if evidence.kind not in ("masks", "panoptic", "tracked"):
         raise InputError(
             f"{folder}: expected label maps or segments of objects (masks, panoptic, tracked), "
