@@ -4,8 +4,8 @@
         [--steps 2000] [--longest 1600] [--max-gaussians N] [--seed 0]
 
 One fit of the preset `quick` for each name of `--evidence` (`none` learns from photographs alone),
-as `splatseg fit DATA --masks off --preset quick --steps N --seed S --evidence NAME` has it. Then the
-true instance maps of the training views are lifted by `uplift`, and `masks_sam` is associated,
+as `splatseg fit DATA --masks off --preset quick --steps N --seed S --evidence NAME` has it. The
+instance maps of the training views are lifted by `uplift`, and `masks_sam` is associated,
 and both are scored on the test views by the independent scorer (rows of `labels.py`). Seconds are
 of the wall and of all processors. `--longest` and `--max-gaussians` make small fits.
 """
