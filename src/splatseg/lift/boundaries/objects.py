@@ -135,7 +135,13 @@ class ObjectLabels:
 
     def loss(self, generator: torch.Generator) -> ExtraLoss:
         """The loss of a step, see `lift.boundaries.sharpen`; zero in views without evidence."""
-        return LabelLoss(self._maps, self._labels, self._options, generator, self._backend)
+        of_labels = LabelLoss(self._maps, self._labels, self._options, generator, self._backend)
+        known = frozenset(self._names)
+
+        def loss(view: View, gaussians: Gaussians, rows: Int64[Tensor, "m"]) -> Tensor:
+            return of_labels(view, gaussians, rows) if view.name in known else torch.zeros(())
+
+        return loss
 
     def state(self) -> dict[str, Tensor]:
         """Labels and, once they are decided, the label maps in use."""

@@ -360,9 +360,7 @@ class LabelLoss:
     backend: str
 
     def __call__(self, view: View, gaussians: Gaussians, rows: Int64[Tensor, "m"]) -> Tensor:
-        """Weight times the share of the light that is missing; zero without a map of the view."""
-        if view.name not in self.label_maps.kept:
-            return torch.zeros(())
+        """Weight times the share of the light that is missing."""
         view_map = self.label_maps.label_map(view.name)
         own = self.labels[rows.cpu()]
         known = self.label_maps.ids | {UNLABELLED, *torch.unique(own).tolist()}
