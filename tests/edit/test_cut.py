@@ -23,7 +23,7 @@ ALL = CutOptions(min_pixels=0)
 def every_pixel_counts(monkeypatch) -> None:
     """However little shows a Gaussian, and at borders as elsewhere."""
     monkeypatch.setattr(module, "_MIN_WEIGHT", 0)
-    monkeypatch.setattr(module, "_BORDER_WEIGHT", 1)
+    monkeypatch.setattr(module, "BORDER_WEIGHT", 1)
 
 
 class Halves:

@@ -160,7 +160,7 @@ def test_a_whole_scene_moves_with_its_cameras(document) -> None:
 
 def test_parts_take_the_label_of_their_side(rng, monkeypatch) -> None:
     """A long Gaussian of object 1 reaches into object 2: its far part becomes 2."""
-    for name, value in (("_ROUNDS", 1), ("_MIN_WEIGHT", 0), ("_BORDER_WEIGHT", 1)):
+    for name, value in (("_ROUNDS", 1), ("_MIN_WEIGHT", 0), ("BORDER_WEIGHT", 1)):
         monkeypatch.setattr(cut, name, value)
     from .test_cut import gaussians_at
 

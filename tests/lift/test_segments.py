@@ -8,9 +8,9 @@ import torch
 
 from splatseg.core import LabelMap, Labels, MaskSet, View
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.lift import MatchedMaps, label_map
+from splatseg.lift import MatchedMaps, ReducedMaps, label_map
 
-from .conftest import BACKEND, camera_at, gaussians_at
+from .conftest import BACKEND, Maps, camera_at, gaussians_at
 
 A, B = 4, 9
 """Ids of the layer: the left and the right of two dots."""
@@ -164,3 +164,15 @@ def test_refused() -> None:
     short = Labels(ids=LAYER.ids[:1], confidence=LAYER.confidence[:1])
     with pytest.raises(ShapeError, match="labels: expected 2 rows"):
         MatchedMaps(gaussians=SCENE, views=[], source=source, labels=short)
+
+
+def test_reduced_maps_take_the_middle_of_each_cell_with_its_confidence() -> None:
+    ids = torch.arange(24, dtype=torch.int32).reshape(4, 6)
+    source = Maps({"v": LabelMap(ids=ids, confidence=ids / 24)})
+    for longest in (6, 100):
+        assert ReducedMaps(source=source, longest_side=longest).label_map("v") is source.maps["v"]
+    found = ReducedMaps(source=source, longest_side=3).label_map("v")
+    assert found.ids.tolist() == [[7, 9, 11], [19, 21, 23]]
+    assert torch.equal(found.confidence, found.ids / 24)
+    plain = ReducedMaps(source=Maps({"v": LabelMap(ids=ids)}), longest_side=3).label_map("v")
+    assert plain.confidence is None

@@ -11,7 +11,7 @@ from splatseg.fit import FitOptions
 from splatseg.io.images import save_png
 from splatseg.lift import SharpenOptions, UpliftOptions, correct_confusion, sharpen, uplift
 from splatseg.lift.boundaries import sharpen as module
-from splatseg.lift.boundaries.sharpen import _CachedLabelMaps, _LabelLoss
+from splatseg.lift.boundaries.sharpen import CachedLabelMaps, LabelLoss
 from splatseg.render import back_project, render
 from splatseg.render.cpu import set_threads, threads
 
@@ -170,7 +170,7 @@ def test_codes_have_the_exact_value_and_gradient_on_average(scene, monkeypatch) 
     monkeypatch.setattr(module, "_CODES", 1)
     options = SharpenOptions(label_weight=0.3)
     generator = torch.Generator().manual_seed(0)
-    loss = _LabelLoss(_CachedLabelMaps(maps), labels, options, generator, "cpu")
+    loss = LabelLoss(CachedLabelMaps(maps), labels, options, generator, "cpu")
     value, mean_gradient = 0.0, torch.zeros(len(gaussians))
     for _ in range(400):
         one, one_gradient = gradient_of(lambda leaf: loss(view, leaf, rows))
@@ -192,10 +192,10 @@ def test_pixels_and_gaussians_without_a_label_say_nothing(scene) -> None:
     all_left = torch.full((len(gaussians),), LEFT, dtype=torch.int32)
 
     def value(label_map, labels) -> float:
-        label_maps = _CachedLabelMaps(Maps({view.name: label_map}))
+        label_maps = CachedLabelMaps(Maps({view.name: label_map}))
         options = SharpenOptions(label_weight=1.0)
         return float(
-            _LabelLoss(label_maps, labels, options, generator, "cpu")(view, gaussians, rows)
+            LabelLoss(label_maps, labels, options, generator, "cpu")(view, gaussians, rows)
         )
 
     alpha = float(render(gaussians, view.camera, backend="cpu").alpha.mean())

@@ -8,6 +8,7 @@ from splatseg.core.checkpoints import Checkpoints as Checkpoints
 from splatseg.fit._checkpoint import CheckpointSummary as CheckpointSummary
 from splatseg.fit._checkpoint import checkpoint_gaussians as checkpoint_gaussians
 from splatseg.fit._checkpoint import checkpoint_summary as checkpoint_summary
+from splatseg.fit._objects import ObjectSupervision as ObjectSupervision
 from splatseg.fit._options import FitOptions as FitOptions
 from splatseg.fit._options import Preset as Preset
 from splatseg.fit._options import Strategy as Strategy

@@ -190,7 +190,12 @@ _WITH_LENGTH = "max_gaussians"
 
 
 def fit_identity(
-    capture: Capture, views: Iterable[View], *, options: FitOptions, backend: str
+    capture: Capture,
+    views: Iterable[View],
+    *,
+    options: FitOptions,
+    backend: str,
+    objects: str | None = None,
 ) -> dict[str, Any]:
     """Digests of a fit's data, its options, and its backend.
 
@@ -202,6 +207,7 @@ def fit_identity(
         views: The training views.
         options: The options of the fit.
         backend: Name of the renderer in use.
+        objects: Digest of the evidence of objects, if any.
     """
     views = tuple(views)
     names = [view.name for view in views]
@@ -213,6 +219,8 @@ def fit_identity(
         "depth maps": digest([*map(_depth, views)]),
         "start points": _points(capture),
     }
+    if objects is not None:
+        data["evidence of objects"] = objects
     return {
         "data": data,
         "options": _as_recorded(options),

@@ -20,6 +20,10 @@ _LOW_PASS_SIGMA = 0.55
 # The Jacobian is taken at most this far outside the image, in half image sizes.
 _FRUSTUM_MARGIN = 0.3
 
+_MIN_SCALE = 1e-12
+_OPACITY_MARGIN = 1e-6
+"""Clamps scales and opacities, whose logs and logits would be infinite at the limits."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Parameters:
@@ -97,6 +101,18 @@ def final_gaussians(parameters: Parameters) -> Gaussians:
         scales=torch.from_numpy(exponential(raw["log_scales"].numpy())),
         opacities=torch.from_numpy(sigmoid(raw["logits"].squeeze(1).numpy())),
         sh=raw["sh"].reshape(len(parameters), -1, 3).clone(),
+    )
+
+
+def raw_parameters(gaussians: Gaussians) -> Parameters:
+    """Unconstrained parameters of Gaussians, copied. Inverse of `final_gaussians`."""
+    opacities = gaussians.opacities.clamp(_OPACITY_MARGIN, 1 - _OPACITY_MARGIN)
+    return Parameters(
+        means=gaussians.means.float().clone(),
+        log_scales=gaussians.scales.float().clamp_min(_MIN_SCALE).log(),
+        rotations=gaussians.rotations.float().clone(),
+        logits=opacities.float().logit().unsqueeze(1),
+        sh=gaussians.sh.float().reshape(len(gaussians), -1).clone(),
     )
 
 

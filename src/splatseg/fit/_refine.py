@@ -17,17 +17,19 @@ from splatseg.core import Camera, Gaussians, View
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError
 from splatseg.fit._options import FitOptions
-from splatseg.fit._parameters import Parameters, UpdateSettings, final_gaussians, rates_at
+from splatseg.fit._parameters import (
+    Parameters,
+    UpdateSettings,
+    final_gaussians,
+    rates_at,
+    raw_parameters,
+)
 from splatseg.fit._photographs import TrainingPhotographs
 from splatseg.fit._start import scene_extent
 from splatseg.fit._step import ExtraLoss, StepSettings, TrainingStep
 from splatseg.fit._views import Exposure, ViewModules
 from splatseg.render import get_backend, options_for, prepare, render
 from splatseg.render.warp import undistorted_camera
-
-_MIN_SCALE = 1e-12
-_OPACITY_MARGIN = 1e-6
-"""Clamps scales and opacities, whose logs and logits would be infinite at the limits."""
 
 _DEPTH_PIXELS = 64
 """Longest side of the depth maps that replace start points."""
@@ -96,7 +98,7 @@ class Refinement:
             views=self._views,
             generator=self._generator,
         )
-        raw = _parameters(gaussians)
+        raw = raw_parameters(gaussians)
         device = self._training.device
         parameters = Parameters(**{name: part.to(device) for name, part in raw.tensors()})
         self._state = (parameters, parameters.zeros_like(), parameters.zeros_like())
@@ -172,18 +174,6 @@ def _points_of(gaussians: Gaussians, views: Sequence[View], *, backend: str) -> 
         covered = depth > 0
         found.append(camera.unproject(camera.pixel_centres()[covered], depth[covered]))
     return torch.cat(found).float()
-
-
-def _parameters(gaussians: Gaussians) -> Parameters:
-    """Unconstrained parameters of Gaussians, copied."""
-    opacities = gaussians.opacities.clamp(_OPACITY_MARGIN, 1 - _OPACITY_MARGIN)
-    return Parameters(
-        means=gaussians.means.float().clone(),
-        log_scales=gaussians.scales.float().clamp_min(_MIN_SCALE).log(),
-        rotations=gaussians.rotations.float().clone(),
-        logits=opacities.float().logit().unsqueeze(1),
-        sh=gaussians.sh.float().reshape(len(gaussians), -1).clone(),
-    )
 
 
 @boundary

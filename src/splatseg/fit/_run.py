@@ -21,6 +21,7 @@ from splatseg.fit._checkpoint import (
     parameters_of,
 )
 from splatseg.fit._density import strategy_of
+from splatseg.fit._objects import ObjectRounds, ObjectSupervision
 from splatseg.fit._options import DEAD_OPACITY, FitOptions
 from splatseg.fit._parameters import (
     Parameters,
@@ -129,6 +130,7 @@ def fit(
     backend: str = "auto",
     progress: Callable[[FitProgress], None] | None = None,
     checkpoints: Checkpoints | None = None,
+    objects: ObjectSupervision | None = None,
 ) -> FitResult:
     """Optimise Gaussians so that their renders match the training photographs of a capture.
 
@@ -145,6 +147,8 @@ def fit(
             interrupts at once.
         checkpoints: Where checkpoints are written, to resume after an interruption or a crash.
             A resumed fit gives the result of an uninterrupted one. None writes none.
+        objects: Evidence of objects, learnt from progress 0.6 on beside the photographs: Gaussians
+            that show two are split, and those of each move to its pixels. None is none.
 
     Raises:
         InputError: If the capture has no training photographs or no start points, or the
@@ -162,11 +166,14 @@ def fit(
         )
     clock = None
     if checkpoints is not None:
-        identity = fit_identity(capture, views, options=options, backend=renderer.name)
+        evidence = None if objects is None else objects.digest
+        identity = fit_identity(
+            capture, views, options=options, backend=renderer.name, objects=evidence
+        )
         clock = CheckpointClock(checkpoints, identity=identity)
     photographs = TrainingPhotographs.of(views, options=options)
     saved = None if clock is None else clock.saved()
-    run = FitRun(capture, options, renderer, photographs, saved=saved)
+    run = FitRun(capture, options, renderer, photographs, saved=saved, objects=objects)
     with deferred_interrupts() as interrupts:
         interrupted = _run_steps(run, interrupts, clock=clock, progress=progress)
         at_end = checkpoints is not None and checkpoints.at_end
@@ -210,7 +217,9 @@ class FitRun:
         photographs: TrainingPhotographs,
         *,
         saved: FitState | None = None,
+        objects: ObjectSupervision | None = None,
     ) -> None:
+        self._objects = None if objects is None else ObjectRounds(objects, options=options)
         self._begin = time.monotonic()
         self._options = options
         self._backend = backend
@@ -247,8 +256,9 @@ class FitRun:
             self._state = (start, start.zeros_like(), start.zeros_like())
         else:
             self._restore(saved)
+        growth = options if self._objects is None else self._objects.growth
         self._density = strategy_of(
-            options, start=self._start_count, extent=self._extent, device=self._device
+            growth, start=self._start_count, extent=self._extent, device=self._device
         )
         if saved is not None:
             for name, module in self._modules().items():
@@ -317,7 +327,10 @@ class FitRun:
 
     def _modules(self) -> dict[str, StatefulModule]:
         """Modules with state of their own, by the name of their group in the checkpoint."""
-        return {"density": self._density, **self.views.stateful_modules()}
+        found: dict[str, StatefulModule] = {"density": self._density}
+        if self._objects is not None:
+            found["objects"] = self._objects
+        return found | self.views.stateful_modules()
 
     def _restore(self, saved: FitState) -> None:
         """Restore a state, except that of the modules."""
@@ -361,7 +374,9 @@ class FitRun:
                 antialiased=self._options.antialiased,
                 low_pass=self._options.low_pass_drawn,
             ),
-            screen_gradients=self._density.needs_screen_gradients,
+            screen_gradients=self._density.needs_screen_gradients
+            and done < self._options.densify_until,
+            extra_loss=None if self._objects is None else self._objects.loss(self._generator),
         )
         found = self._training.gradients(parameters, example, settings=settings)
         with self._training.timed("update"), torch.no_grad():
@@ -379,6 +394,9 @@ class FitRun:
             self._state = self._density.after_step(
                 self._state, steps=self.steps, progress=done, generator=self._generator
             )
+        if self._objects is not None:
+            with self._training.timed("objects"), torch.no_grad():
+                self._state = self._objects.after_step(self._state, progress=self.progress)
         return self._report(found.loss)
 
     def _reduction(self, camera: Camera, progress: float) -> int:

@@ -4,6 +4,7 @@ from splatseg.lift.boundaries.cut import Cut as Cut
 from splatseg.lift.boundaries.cut import CutOptions as CutOptions
 from splatseg.lift.boundaries.cut import cut_box as cut_box
 from splatseg.lift.boundaries.cut import cut_masks as cut_masks
+from splatseg.lift.boundaries.objects import ObjectLabels as ObjectLabels
 from splatseg.lift.boundaries.sharpen import Sharpened as Sharpened
 from splatseg.lift.boundaries.sharpen import SharpenOptions as SharpenOptions
 from splatseg.lift.boundaries.sharpen import sharpen as sharpen
@@ -22,6 +23,7 @@ from splatseg.lift.point_labels import PointRule as PointRule
 from splatseg.lift.point_labels import labels_of_points as labels_of_points
 from splatseg.lift.segments import EvidenceSegments as EvidenceSegments
 from splatseg.lift.segments import MatchedMaps as MatchedMaps
+from splatseg.lift.segments import ReducedMaps as ReducedMaps
 from splatseg.lift.vocabulary import TextSpace as TextSpace
 from splatseg.lift.vocabulary import relevancy as relevancy
 from splatseg.lift.voting.confusion import ConfusionOptions as ConfusionOptions

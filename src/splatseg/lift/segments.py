@@ -14,6 +14,7 @@ from splatseg.core import (
     Gaussians,
     LabelMap,
     Labels,
+    LabelSource,
     MaskSet,
     Rle,
     SegmentSource,
@@ -91,16 +92,50 @@ def reduced_segments(segments: LabelMap | MaskSet, longest: int) -> LabelMap | M
     if share >= 1:
         return segments
     h, w = max(1, round(share * height)), max(1, round(share * width))
-    down = ((torch.arange(h) + 0.5) * height / h).long()
-    across = ((torch.arange(w) + 0.5) * width / w).long()
 
     def taken(picture: Tensor) -> Tensor:
-        return picture[down.unsqueeze(1), across]
+        return _at_middles(picture, h, w)
 
     if isinstance(segments, LabelMap):
         return LabelMap(ids=taken(segments.ids.cpu()))
     masks = tuple(Rle.encode(taken(mask.decode())) for mask in segments.masks)
     return replace(segments, height=h, width=w, masks=masks)
+
+
+def _at_middles(picture: Tensor, h: int, w: int) -> Tensor:
+    """What is at the middle of each of h x w cells."""
+    height, width = picture.shape
+    down = ((torch.arange(h) + 0.5) * height / h).long()
+    across = ((torch.arange(w) + 0.5) * width / w).long()
+    return picture[down.unsqueeze(1), across]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ReducedMaps:
+    """Label maps with at most so many pixels along their longest side: a `LabelSource`."""
+
+    source: LabelSource
+
+    longest_side: int
+    """Pixels. Larger maps take the pixel at the middle of each cell, its confidence included."""
+
+    @property
+    def view_names(self) -> Sequence[str]:
+        """Views of the source."""
+        return self.source.view_names
+
+    def label_map(self, name: str) -> LabelMap:
+        """The map of a view."""
+        full = self.source.label_map(name)
+        share = self.longest_side / max(full.height, full.width)
+        if share >= 1:
+            return full
+        h, w = max(1, round(share * full.height)), max(1, round(share * full.width))
+        confidence = full.confidence
+        return LabelMap(
+            ids=_at_middles(full.ids.cpu(), h, w),
+            confidence=None if confidence is None else _at_middles(confidence.cpu(), h, w),
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

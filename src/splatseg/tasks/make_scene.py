@@ -27,7 +27,7 @@ from splatseg.io.captures import read_start_points
 from splatseg.io.scans import read_scans
 from splatseg.io.scene import save_scene
 from splatseg.io.scene_folder import CHECKPOINT_FILE, GAUSSIANS_FILE, POSES_FOLDER, scene_path
-from splatseg.lift import GaussianField
+from splatseg.lift import GaussianField, ObjectLabels
 from splatseg.pose import PoseReport, load_pose_report
 from splatseg.pose.pointmaps import PointmapReport
 from splatseg.render import BackendName
@@ -35,6 +35,7 @@ from splatseg.report.fit_report import FitReportData, FitVerdict, fit_record, fi
 from splatseg.report.images import Gallery, GalleryImage, colour_difference
 from splatseg.report.maps import camera_map
 from splatseg.tasks.checkpoints import check_fit_output, fit_folder
+from splatseg.tasks.fit_objects import object_labels
 from splatseg.tasks.moving import (
     LeftOut,
     capture_without_moving,
@@ -127,6 +128,11 @@ def fit_capture(
     with fit_folder(folder):
         began = time.monotonic()
         capture, poses, moving = _capture(data, folder, options, fit_options, observer)
+        objects: ObjectLabels | None = None
+        if options.evidence is not None:
+            objects = object_labels(
+                capture, options.evidence, scene=folder, options=fit_options, backend=backend
+            )
         timings = {"photographs and poses": time.monotonic() - began}
         checkpoints = options.checkpoints(
             folder / CHECKPOINT_FILE,
@@ -143,6 +149,7 @@ def fit_capture(
             fit_options,
             checkpoints,
             record=_record(options, moving),
+            objects=objects,
             backend=backend,
             observer=observer,
         )
@@ -249,6 +256,7 @@ def _fitted(
     checkpoints: Checkpoints,
     *,
     record: Mapping[str, Any],
+    objects: ObjectLabels | None,
     backend: BackendName,
     observer: Observer,
 ) -> tuple[FitResult, bool]:
@@ -261,6 +269,7 @@ def _fitted(
                 backend=backend,
                 progress=FitSteps(step),
                 checkpoints=checkpoints,
+                objects=objects,
             )
         provenance = _provenance(record, fit_options, backend, result)
         scene = scene_of_capture(
@@ -316,6 +325,7 @@ def _record(options: MakeSceneOptions, moving: LeftOut | None) -> dict[str, Any]
     """What the scene remembers of what is around the fit."""
     return {
         **({} if options.depth_evidence is None else {"depth_evidence": options.depth_evidence}),
+        **({} if options.evidence is None else {"evidence": options.evidence}),
         **({} if options.scans is None else {"scans": str(options.scans)}),
         **({} if options.points is None else {"points": str(options.points)}),
         **({} if moving is None else {"moving": moving.record}),

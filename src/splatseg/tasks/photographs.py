@@ -86,6 +86,11 @@ class MakeSceneOptions(CheckpointOptions):
     """Evidence of depth, as see --what depth writes it, instead of the capture's depth maps: a
     folder, or its name in the capture or in a scene that is replaced."""
 
+    evidence: str | None = None
+    """Evidence of objects that is learnt beside the photographs: label maps or masks, a folder or
+    its name in the capture or in a scene that is replaced. Gaussians that lie on two objects are
+    split; takes up to twice the time."""
+
     scans: Path | None = None
     """Laser scans in the world of the capture: the fit starts at their points and learns their
     depth as metric depth. For streets, whose far and thin objects photographs place badly."""

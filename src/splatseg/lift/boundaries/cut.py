@@ -41,7 +41,7 @@ from splatseg.lift.voting.uplift import voting_views
 from splatseg.render import RenderOptions, options_for, prepare
 from splatseg.selection import box_corners
 
-_MIN_VIEW_WEIGHT = 1e-4
+MIN_VIEW_WEIGHT = 1e-4
 """Blending weight in one view, below which a mean position is not used."""
 
 INSIDE, OUTSIDE = 1, 2
@@ -56,7 +56,7 @@ _PARTS = 3
 _MIN_WEIGHT = 0.5
 """Evidence that a Gaussian must have to be split at a mask, in pixels that show it fully."""
 
-_BORDER_WEIGHT = 0.1
+BORDER_WEIGHT = 0.1
 """Weight of a pixel at the border of a mask: it shows both sides."""
 
 
@@ -156,7 +156,7 @@ def cut_masks(
             views,
             evidence,
             ids,
-            border_weight=_BORDER_WEIGHT,
+            border_weight=BORDER_WEIGHT,
             backend=backend,
             step=step,
         )
@@ -368,9 +368,9 @@ def sides_of(
     for view in views:
         label_map = evidence.label_map(view.name)
         camera = camera_of_map(view, *label_map.ids.shape)
-        image = _side_image(label_map, ids, border_weight).unsqueeze(-1) * _plane(camera).unsqueeze(
-            2
-        )
+        image = _side_image(label_map, ids, border_weight).unsqueeze(-1) * plane_of_pixels(
+            camera
+        ).unsqueeze(2)
         with (
             torch.no_grad(),
             prepare(gaussians, camera, options=options, backend=backend) as prepared,
@@ -379,10 +379,10 @@ def sides_of(
         moments = sums.cpu().float()
         inside += moments[:, 0]
         outside += moments[:, 3]
-        on_both = (moments[:, 0] > _MIN_VIEW_WEIGHT) & (moments[:, 3] > _MIN_VIEW_WEIGHT)
+        on_both = (moments[:, 0] > MIN_VIEW_WEIGHT) & (moments[:, 3] > MIN_VIEW_WEIGHT)
         rows = torch.nonzero(on_both).squeeze(1)
         if len(rows):
-            direction[rows] += _view_direction(
+            direction[rows] += view_direction(
                 gaussians[rows], axes[rows], camera, moments[rows], options
             )
         step()
@@ -415,7 +415,7 @@ def on_border(ids: Int[Tensor, "height width"]) -> Tensor:
     return mixed
 
 
-def _plane(camera: Camera) -> Float[Tensor, "height width 3"]:
+def plane_of_pixels(camera: Camera) -> Float[Tensor, "height width 3"]:
     """1, x and y of every pixel's centre on the plane z = 1 of the camera."""
     _, rays = camera.rays()
     rotation = camera.cam_from_world.double()[:3, :3]
@@ -426,7 +426,7 @@ def _plane(camera: Camera) -> Float[Tensor, "height width 3"]:
     return torch.cat((torch.ones_like(z), flat), dim=-1).float()
 
 
-def _view_direction(
+def view_direction(
     gaussians: Gaussians, axes: Tensor, camera: Camera, moments: Tensor, options: RenderOptions
 ) -> Tensor:
     """One view's term of g."""

@@ -149,7 +149,7 @@ def sharpen(
     options = options or SharpenOptions()
     update = _LabelUpdate(
         views=_photographed(views, evidence),
-        label_maps=_CachedLabelMaps(evidence),
+        label_maps=CachedLabelMaps(evidence),
         votes=UpliftOptions(candidates=2 if confusion is None else CANDIDATES),
         confusion=confusion,
         backend=backend,
@@ -191,7 +191,7 @@ def _refined(
     )
     for done in range(options.sharpen_steps):
         generator = refinement.generator
-        loss = _LabelLoss(trusted, labels.ids.cpu(), options, generator, update.backend)
+        loss = LabelLoss(trusted, labels.ids.cpu(), options, generator, update.backend)
         refinement.step(loss)
         last = done + 1 == options.sharpen_steps
         if last or (done + 1) % DECIDE_EVERY == 0:
@@ -214,7 +214,7 @@ class _LabelUpdate:
     """Decides labels from the votes of views, whenever Gaussians changed."""
 
     views: Sequence[View]
-    label_maps: "_CachedLabelMaps"
+    label_maps: "CachedLabelMaps"
     votes: UpliftOptions
     confusion: ConfusionOptions | None
     backend: str
@@ -230,14 +230,14 @@ class _LabelUpdate:
             labels = correct_confusion(votes, options=self.confusion, view_correlation=correlation)
         return labels, _agreement(votes, labels)
 
-    def trusted(self, gaussians: Gaussians, labels: Labels, pixels: int) -> "_CachedLabelMaps":
+    def trusted(self, gaussians: Gaussians, labels: Labels, pixels: int) -> "CachedLabelMaps":
         """The label maps without what contradicts the layer; all of them where pixels is -1."""
         if pixels < 0:
             return self.label_maps
         hard = replace(labels, candidates=None, shares=None)
         by_name = {view.name: view for view in self.views}
-        return _CachedLabelMaps(
-            _TrustedLabelMaps(self.label_maps, gaussians, by_name, hard, pixels, self.backend)
+        return CachedLabelMaps(
+            TrustedLabelMaps(self.label_maps, gaussians, by_name, hard, pixels, self.backend)
         )
 
 
@@ -252,7 +252,7 @@ def _agreement(votes: Labels, labels: Labels) -> float:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _CachedLabelMaps:
+class CachedLabelMaps:
     """Label maps, compressed once they were made: some are rendered each time."""
 
     source: LabelSource
@@ -262,9 +262,11 @@ class _CachedLabelMaps:
 
     @property
     def view_names(self) -> Sequence[str]:
+        """Views of the source."""
         return self.source.view_names
 
     def label_map(self, name: str) -> LabelMap:
+        """The map of a view, decompressed."""
         if name not in self.kept:
             view_map = self.source.label_map(name)
             self.ids.update(torch.unique(view_map.ids).tolist())
@@ -276,12 +278,33 @@ class _CachedLabelMaps:
         confidence = None if packed is None else _decompressed(packed, np.float32, shape)
         return LabelMap(ids=_decompressed(ids, np.int32, shape), confidence=confidence)
 
+    def state(self, names: Sequence[str]) -> dict[str, Tensor]:
+        """The maps of some views as they are kept, for a checkpoint."""
+        sizes: list[tuple[int, ...]] = []
+        blocks: list[bytes] = []
+        for name in names:
+            shape, ids, confidence = self.kept[name]
+            sizes.append((*shape, len(ids), len(confidence or b"")))
+            blocks += [ids, confidence or b""]
+        maps = np.frombuffer(b"".join(blocks), np.uint8).copy()
+        return {"maps": torch.from_numpy(maps), "sizes": torch.tensor(sizes).reshape(-1, 4)}
+
+    def restore(self, names: Sequence[str], tensors: Mapping[str, Tensor]) -> None:
+        """Keep what `state` returned of the same views, instead of what the source has."""
+        maps, at = tensors["maps"].numpy().tobytes(), 0
+        for name, row in zip(names, tensors["sizes"].tolist(), strict=True):
+            height, width, ids, confidence = row
+            packed = maps[at + ids : at + ids + confidence] or None
+            self.kept[name] = ((height, width), maps[at : at + ids], packed)
+            self.ids.update(torch.unique(self.label_map(name).ids).tolist())
+            at += ids + confidence
+
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _TrustedLabelMaps:
+class TrustedLabelMaps:
     """Label maps without the pixels that contradict what a layer shows around them."""
 
-    label_maps: _CachedLabelMaps
+    label_maps: CachedLabelMaps
     gaussians: Gaussians
     views: Mapping[str, View]
     labels: Labels
@@ -290,9 +313,11 @@ class _TrustedLabelMaps:
 
     @property
     def view_names(self) -> Sequence[str]:
+        """Views of the label maps."""
         return self.label_maps.view_names
 
     def label_map(self, name: str) -> LabelMap:
+        """The map of a view, without what the layer does not show near."""
         view_map = self.label_maps.label_map(name)
         camera = camera_of_map(self.views[name], view_map.height, view_map.width)
         rendered = label_map(self.gaussians, camera, self.labels, backend=self.backend).ids
@@ -325,16 +350,17 @@ def _decompressed(compressed: bytes, kind: type[np.generic], shape: tuple[int, .
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _LabelLoss:
+class LabelLoss:
     """The second term of the loss, for one step."""
 
-    label_maps: _CachedLabelMaps
+    label_maps: CachedLabelMaps
     labels: Int32[Tensor, "n"]
     options: SharpenOptions
     generator: torch.Generator
     backend: str
 
     def __call__(self, view: View, gaussians: Gaussians, rows: Int64[Tensor, "m"]) -> Tensor:
+        """Weight times the share of the light that is missing."""
         view_map = self.label_maps.label_map(view.name)
         own = self.labels[rows.cpu()]
         known = self.label_maps.ids | {UNLABELLED, *torch.unique(own).tolist()}
