@@ -177,8 +177,10 @@ def test_another_inpainter_paints(filled) -> None:
 
 def test_inpainters_have_names(monkeypatch) -> None:
     assert find_inpainter("opencv") == OpenCvInpainter()
-    with pytest.raises(InputError, match="a model that inpaints, classical does not"):
-        find_inpainter("classical")
+    for name in ("classical", "nothing"):
+        with pytest.raises(InputError, match=f"fill: .* a model that inpaints, got '{name}'"):
+            find_inpainter(name)
+    monkeypatch.setattr("splatseg.edit.holes.model_names", lambda: ("painter",))
     monkeypatch.setattr("splatseg.edit.holes.find_model", lambda _: Painter())
     assert find_inpainter("painter") == Painter()
 

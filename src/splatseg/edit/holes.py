@@ -51,7 +51,7 @@ from splatseg.edit.planes import (
     small_camera,
 )
 from splatseg.errors import InputError
-from splatseg.models import find_model
+from splatseg.models import find_model, model_names
 from splatseg.render import back_project
 
 OPENCV = "opencv"
@@ -106,9 +106,9 @@ def find_inpainter(name: str) -> Inpainting:
     """
     if name == OPENCV:
         return OpenCvInpainter()
-    model = find_model(name)
+    model = find_model(name) if name in model_names() else None
     if not isinstance(model, Inpainting):
-        raise InputError(f"fill: expected {OPENCV} or a model that inpaints, {name} does not.")
+        raise InputError(f"fill: expected {OPENCV} or a model that inpaints, got {name!r}.")
     return model
 
 
