@@ -406,6 +406,10 @@ def special(world: World, by_type: dict[type, Any]) -> dict[str, Any]:
         "synthetic.machine_labels.truths": {"a": world.truth},
         "synthetic.start_points.truths": {"a": world.truth, "b": world.truth},
         "synthetic.write_capture.folder": world.folder / "capture",
+        "edit.filled_layer.filled": edit.Filled(
+            gaussians=world.gaussians[:0], holes=torch.zeros(0, dtype=torch.int64), rims=()
+        ),
+        "edit.filled_layer.layer": world.labels,
         "edit.layer_called.address": "things",
         "edit.merged_layers.others": {"things": world.labels},
         "edit.replay.history": (),
@@ -531,6 +535,7 @@ def inner(world: World, by_type: dict[type, Any]) -> dict[str, Any]:
         "fit.random_point_count.options": FitOptions(),
         "fit.Refinement.options": FitOptions(),
         "fit.exposures_record.exposures": {},
+        "edit.refit.provenance": {},
         "fit.recorded_exposures.provenance": {},
         "fit.refinement_options.provenance": {},
         "pose.doctor.write_corrected.diagnosis": Diagnosis(

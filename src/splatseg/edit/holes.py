@@ -155,8 +155,6 @@ def fill(
     Raises:
         InputError: If there are no views, or the inpainter gives no image of the same size.
     """
-    if not views:
-        raise InputError("views: expected at least one, got none.")
     cameras = [small_camera(view) for view in _spaced(views)]
     scene = Removal(gaussians, removed, backend)
     rim = rim_cameras(scene, cameras)
@@ -204,6 +202,9 @@ def exposed(
 
     Returns:
         The Gaussians; none of them is removed already.
+
+    Raises:
+        InputError: If there are no views.
     """
     cameras = [small_camera(view) for view in _spaced(views)]
     everything = torch.ones(len(gaussians), dtype=torch.bool)
@@ -233,6 +234,8 @@ def _visibility(
 
 def _spaced(views: Sequence[View]) -> list[View]:
     """The views by name, evenly fewer where there are many."""
+    if not views:
+        raise InputError("views: expected at least one, got none.")
     ordered = sorted(views, key=lambda view: view.name)
     return ordered[:: -(-len(ordered) // _MOST_VIEWS)]
 
