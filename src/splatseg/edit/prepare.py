@@ -85,11 +85,14 @@ def prepare(
         progress: Called with the views done and all there are to do.
 
     Raises:
-        InputError: If the selection is empty or names what is not there.
+        InputError: If the selection is empty or names what is not there, or a scene that was
+            edited before is to be refitted.
     """
     where = operation.where
     if where is None:
         return Prepared(document=document, selection=None, split=0)
+    if operation.refit is not None and document.history:
+        raise InputError("refit: the photographs show the scene before it was edited.")
     gaussians = document.scene.gaussians
     chosen = select_where(gaussians, document.layers, where)
     if operation.cut is None:
@@ -112,8 +115,6 @@ def _refitted(
     document, chosen, where = ready.document, ready.selection, operation.where
     if chosen is None or where is None:
         return ready
-    if document.history:
-        raise InputError("refit: the photographs show the scene before it was edited.")
     scene, cut = document.scene, operation.cut
     if cut is not None and cut.by == "masks":
         views = [scene.view(name) for name in cut.views]
