@@ -22,6 +22,7 @@ from splatseg.edit import (
 from splatseg.edit.holes import OpenCvInpainter
 from splatseg.errors import InputError, ShapeError
 from splatseg.render import render
+from splatseg.render.cpu import set_threads, threads
 from splatseg.selection import Where
 from splatseg.synthetic import look_at
 
@@ -117,9 +118,15 @@ def test_holes_have_the_rim_of_their_plane(filled) -> None:
     assert float(around[:, 2].abs().max()) < 0.2
 
 
-def test_order_of_views_changes_nothing(filled) -> None:
+@pytest.mark.bits
+def test_neither_order_of_views_nor_threads_change_anything(filled) -> None:
     gaussians, ids, _, found = filled
-    again = fill(gaussians, only(ids, THING), views()[::-1], backend=BACKEND)
+    before = threads()
+    try:
+        set_threads(3)
+        again = fill(gaussians, only(ids, THING), views()[::-1], backend=BACKEND)
+    finally:
+        set_threads(before)
     for name in ("means", "rotations", "scales", "sh"):
         assert torch.equal(getattr(again.gaussians, name), getattr(found.gaussians, name))
 

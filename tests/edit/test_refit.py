@@ -10,6 +10,7 @@ from splatseg.edit import Document, Operation, apply, prepare, replay
 from splatseg.errors import InputError
 from splatseg.io.images import save_png
 from splatseg.render import back_project, render
+from splatseg.render.cpu import set_threads, threads
 from splatseg.selection import Where
 
 from .conftest import BACKEND, camera
@@ -86,6 +87,21 @@ def test_it_is_in_the_history_and_replays(document) -> None:
         done.scene.gaussians.opacities,
         apply(document, replace(short, refit=8), backend=BACKEND).scene.gaussians.opacities,
     )
+
+
+@pytest.mark.bits
+def test_threads_change_nothing(document) -> None:
+    with_threads = []
+    before = threads()
+    try:
+        for count in (1, 3):
+            set_threads(count)
+            ready = prepare(document, replace(REMOVAL, refit=6), backend=BACKEND)
+            with_threads.append(ready.document.scene.gaussians)
+    finally:
+        set_threads(before)
+    for name in ("means", "rotations", "scales", "opacities", "sh"):
+        assert torch.equal(*(getattr(one, name) for one in with_threads))
 
 
 def test_photographs_of_the_scene_as_it_is_are_needed(document) -> None:

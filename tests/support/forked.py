@@ -44,6 +44,8 @@ def run(words, out, err):
     sys.stdin, sys.stdout = open(0, closefd=False), open(1, "w", closefd=False)
     sys.stderr = open(2, "w", buffering=1, errors="backslashreplace", closefd=False)
     sys.argv = ["splatseg", *words]
+    # What a shell starts in the background ignores Ctrl-C, and tests may run there.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     status = 1
     try:
         status = main()

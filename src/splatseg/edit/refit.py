@@ -14,8 +14,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Int64
+from numpy.typing import NDArray
 from torch import Tensor
 
 from splatseg.core import Gaussians, LabelSource, Selection, View, camera_of_map
@@ -63,16 +65,23 @@ def refit(
     Raises:
         InputError: If no view with a photograph shows the thing.
     """
-    loss = _MaskLoss(masks, tuple(ids), thing.mask.cpu().float()[:, None], backend)
-    shown = [view for view in views if view.image is not None and bool(loss.mask(view).any())]
-    if not shown:
-        raise InputError("refit: expected a photograph that shows what is removed, got none.")
+    loss = _MaskLoss({}, thing.mask.cpu().float()[:, None], backend)
+    shown: list[View] = []
     touched = thing.mask.cpu().clone()
-    for view in shown:
-        mask = loss.mask(view)
+    for view in views:
+        if view.image is None:
+            continue
+        found = masks.label_map(view.name).ids
+        mask = torch.isin(found, torch.tensor(ids, dtype=found.dtype))
+        if not bool(mask.any()):
+            continue
+        shown.append(view)
+        loss.masks[view.name] = _Bits.of(mask)
         camera = camera_of_map(view, *mask.shape)
         weights = back_project(gaussians, camera, mask.float()[..., None], backend=backend).sums
         touched |= weights[:, 0].cpu() > _TOUCHED
+    if not shown:
+        raise InputError("refit: expected a photograph that shows what is removed, got none.")
     options = replace(refinement_options(provenance), depth="off", refine_poses=False)
     run = Refinement(
         gaussians,
@@ -96,24 +105,38 @@ def refit(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class _Bits:
+    """A mask, a bit a pixel: reading or drawing a label map costs more than a step of the fit."""
+
+    shape: tuple[int, int]
+    bits: NDArray[np.uint8]
+
+    @staticmethod
+    def of(mask: Tensor) -> "_Bits":
+        height, width = mask.shape
+        return _Bits((height, width), np.packbits(mask.cpu().numpy()))
+
+    def mask(self) -> Tensor:
+        flat = np.unpackbits(self.bits, count=self.shape[0] * self.shape[1])
+        return torch.from_numpy(flat.reshape(self.shape))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class _MaskLoss:
     """The second term of the loss."""
 
-    masks: LabelSource
-    ids: tuple[int, ...]
+    masks: dict[str, _Bits]
+    """Pixels of the thing, of the size of its label map, by the name of the view."""
+
     signal: Tensor
     """1 for Gaussians of the thing, (n, 1)."""
 
     backend: str
 
-    def mask(self, view: View) -> Tensor:
-        """Pixels of the thing, of the size of its label map."""
-        found = self.masks.label_map(view.name).ids
-        return torch.isin(found, torch.tensor(self.ids, dtype=found.dtype))
-
     def __call__(self, view: View, gaussians: Gaussians, rows: Int64[Tensor, "m"]) -> Tensor:
-        mask = self.mask(view)
+        mask = self.masks[view.name].mask()
         signal = self.signal[rows.cpu()].to(gaussians.means)
         camera = camera_of_map(view, *mask.shape)
         own = render(gaussians, camera, signal, backend=self.backend).image[..., 0]
-        return 1 - (own * mask.to(own)).sum() / mask.sum().clamp_min(1)
+        mask = mask.to(own)
+        return 1 - (own * mask).sum() / mask.sum()
