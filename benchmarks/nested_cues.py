@@ -35,13 +35,9 @@ from splatseg.io.scene import load_scene
 from splatseg.lift.segments import EvidenceSegments
 from splatseg.methods.associate import AssociateOptions
 from splatseg.methods.associate._clustering import Nesting, cluster, nesting
+from splatseg.methods.associate._levels import node_levels, separated_levels
 from splatseg.methods.associate._table import SegmentTable, segment_table
-from splatseg.methods.associate._tree import (
-    SegmentTree,
-    node_levels,
-    segment_tree,
-    separated_levels,
-)
+from splatseg.methods.associate._tree import SegmentTree, segment_tree
 from splatseg.neighbours import NeighbourIndex
 
 _LEVELS = ("part", "object", "group")

@@ -14,7 +14,8 @@ from splatseg.core import TREE_LEVELS, InstanceTree, Labels, MaskSet, Rle, View
 from splatseg.errors import InputError, RangeError
 from splatseg.methods.associate import DEFAULT_CONFUSION, AssociateOptions, associate
 from splatseg.methods.associate._clustering import Agreement, cluster
-from splatseg.methods.associate._tree import GROUP, OBJECT, PART, SegmentTree
+from splatseg.methods.associate._levels import GROUP, OBJECT, PART
+from splatseg.methods.associate._tree import SegmentTree
 from splatseg.render.cpu import set_threads, threads
 
 from .test_associate import BACKEND, GAUSSIANS, VIEWS, Segments, columns, table_of

@@ -7,7 +7,8 @@ import pytest
 import scipy.sparse
 
 from splatseg.methods.associate._clustering import Agreement, Nesting, cluster, nesting
-from splatseg.methods.associate._tree import GROUP, OBJECT, PART, SegmentTree, node_levels
+from splatseg.methods.associate._levels import GROUP, OBJECT, PART, node_levels
+from splatseg.methods.associate._tree import SegmentTree
 
 
 def tree(parents: list[int], support: list[float] | None = None) -> SegmentTree:

@@ -9,7 +9,8 @@ import pytest
 import scipy.sparse
 
 from splatseg.methods.associate._clustering import Agreement, Nesting, nesting
-from splatseg.methods.associate._tree import GROUP, OBJECT, PART, SegmentTree, separated_levels
+from splatseg.methods.associate._levels import GROUP, OBJECT, PART, separated_levels
+from splatseg.methods.associate._tree import SegmentTree
 
 GAUSSIANS = 24
 EVERYTHING, SHELF = range(24), range(20)
@@ -166,7 +167,7 @@ def test_children_in_three_of_four_masks_are_parts(inside: int, of: int, divided
 
 
 def test_what_two_divisions_leave_out_ends_beside_the_larger_thing() -> None:
-    module = importlib.import_module("splatseg.methods.associate._tree")
+    module = importlib.import_module("splatseg.methods.associate._levels")
     # 0 holds 1, a fragment, and 2; 1 holds 3 and 4; 4 holds 5. Neither the smaller thing of 1 nor
     # that of 0 holds 5.
     parents = [-1, 0, 0, 1, 1, 4]

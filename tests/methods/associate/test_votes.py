@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 import torch
 
+from splatseg.methods.associate._levels import OBJECT, PART
 from splatseg.methods.associate._table import SegmentTable
-from splatseg.methods.associate._tree import OBJECT, PART, SegmentTree
+from splatseg.methods.associate._tree import SegmentTree
 
 module = importlib.import_module("splatseg.methods.associate._votes")
 PARENTS = np.array([-1, 0, 0, 1, 2, 3])

@@ -44,9 +44,10 @@ from splatseg.lift.segments import EvidenceSegments
 from splatseg.lift.voting.confusion import DEFAULT_CONFUSION, ConfusionOptions, correct_confusion
 from splatseg.methods._method import Method, MethodInputs
 from splatseg.methods.associate._clustering import cluster, nesting
+from splatseg.methods.associate._levels import separated_levels
 from splatseg.methods.associate._memberships import sharpened_votes
 from splatseg.methods.associate._table import SegmentTable, segment_table
-from splatseg.methods.associate._tree import segment_tree, separated_levels
+from splatseg.methods.associate._tree import segment_tree
 from splatseg.methods.associate._votes import (
     category_of,
     instance_tree,

@@ -11,8 +11,9 @@ from torch import Tensor
 from splatseg.core import UNLABELLED, ClassTable, InstanceTree, Labels, TreeLevel, TreeNode
 from splatseg.lift.share_tables import ranked_entries
 from splatseg.lift.voting.confusion import ConfusionOptions, correct_confusion
+from splatseg.methods.associate._levels import GROUP, OBJECT, PART
 from splatseg.methods.associate._table import SegmentTable
-from splatseg.methods.associate._tree import GROUP, OBJECT, PART, SegmentTree
+from splatseg.methods.associate._tree import SegmentTree
 
 CANDIDATES = 8
 """Ids of a Gaussian that are kept, those with most votes."""
