@@ -76,6 +76,16 @@ def test_photographs_in_the_folders_of_the_capture(nerfstudio, write_image, list
     assert capture.notes[0].startswith("photographs were read from images, as they are not where")
 
 
+def test_half_of_the_photographs_in_a_folder_of_the_capture_are_enough(
+    nerfstudio, write_image
+) -> None:
+    folder = nerfstudio(("/home/x/0.png", "/home/x/1.png"), images=False)
+    write_image(folder / "images/1.png")
+    capture = read_capture(folder)
+    assert [view.image for view in capture.views] == [folder / "images/1.png"]
+    assert any(note.startswith("photographs were read from images,") for note in capture.notes)
+
+
 def test_folders_that_tell_photographs_apart_are_kept(nerfstudio, write_image) -> None:
     """One photograph is not that of two cameras."""
     names = ("/home/x/left/0.png", "/home/x/right/0.png")
