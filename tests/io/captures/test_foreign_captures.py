@@ -16,8 +16,10 @@ import pytest
 import torch
 
 from splatseg.core import Gaussians, Scene
+from splatseg.core.json_values import MAX_NUMBER
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.io.captures import read_capture
+from splatseg.io.captures.raw_views import checked_pose
 from splatseg.io.scene import load_scene, save_scene
 
 NAMES = tuple(f"images/{i:02d}.png" for i in range(8))
@@ -228,6 +230,14 @@ def broken(pose: np.ndarray, kind: str) -> list[list[object]]:
     else:
         pose[1, 3] = {"nan": math.nan, "infinite": math.inf, "null": None}[kind]
     return pose.tolist()
+
+
+def test_a_pose_is_as_far_away_as_numbers_go_and_no_farther() -> None:
+    pose = np.eye(4)
+    pose[0, 3] = -MAX_NUMBER
+    assert checked_pose(pose, where="a").tolist() == pose.tolist()
+    with pytest.raises(InputError, match=r"a: expected a pose of numbers up to 1e\+30, got more"):
+        checked_pose(pose * [1, 1, 1, 2], where="a")
 
 
 @pytest.mark.parametrize("kind", ["nan", "infinite", "null", "singular", "twice as large"])
