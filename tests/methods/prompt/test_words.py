@@ -57,6 +57,8 @@ def test_masks_that_hold_no_gaussian_look_like_nothing(fruit) -> None:
     assert int(table.index.max()) == 4
     assert bool((table.iou.diagonal()[pears] > 0).all())
     assert not bool(table.iou[apples].any())
+    assert bool(table.looks.low[pears].isfinite().all())
+    assert not bool(table.looks.low[apples].isfinite().any())
 
 
 def test_features_of_small_things_are_not_those_of_the_wall(fruit, table) -> None:
