@@ -1,9 +1,11 @@
 """Checks of values, where the fast way must not change the answer."""
 
+import numpy as np
 import pytest
 import torch
 
 from splatseg._check import check_finite
+from splatseg.core.coerce import as_tensor
 from splatseg.errors import RangeError
 
 LARGEST = torch.finfo(torch.float32).max
@@ -31,3 +33,17 @@ def test_one_value_that_is_not_finite_is_found(bad) -> None:
     values[2, 3] = -bad
     with pytest.raises(RangeError, match="values: 2 of 12"):
         check_finite("values", values)
+
+
+@pytest.mark.parametrize(
+    ("value", "dtype"),
+    [
+        ([0.1, 0.2], torch.float32),
+        ((0.1, np.float64(0.2)), torch.float32),
+        (0.1, torch.float64),
+        (np.float64(0.1), torch.float64),
+        (np.array([0.1]), torch.float64),
+    ],
+)
+def test_floats_in_lists_become_32_bits_and_others_keep_theirs(value, dtype) -> None:
+    assert as_tensor("values", value, "float").dtype == dtype

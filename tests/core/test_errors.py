@@ -1,6 +1,7 @@
 """Messages are of a size to be read, whatever stands in them."""
 
 import pickle
+from pathlib import Path
 
 import pytest
 
@@ -28,6 +29,16 @@ def test_the_ends_of_a_long_message_are_said() -> None:
     assert len(said) == 1000
     assert said.startswith("names: got a b")
     assert said.endswith("a b in all.")
+
+
+def test_text_that_is_to_be_a_path_can_be_one() -> None:
+    @boundary
+    def opened(folder: Path | str) -> Path | str:
+        return folder
+
+    assert opened("a") == "a"
+    with pytest.raises(InputError, match="folder: expected a path, got ''"):
+        opened("")
 
 
 def test_a_name_too_long_for_a_file_is_an_input_error(tmp_path) -> None:

@@ -49,6 +49,15 @@ def test_hard_layers_follow_the_definition(rng, background, lens) -> None:
     assert len(torch.unique(shown.ids)) > 2
 
 
+def test_confidence_is_at_most_one_where_shares_are_not() -> None:
+    labels = Labels(
+        ids=[1], confidence=[1.0], candidates=torch.tensor([[1]]), shares=torch.tensor([[1.5]])
+    )
+    shown = label_map(gaussians_at([[0, 0, 2.0]], scale=0.5), camera_at(), labels, backend=BACKEND)
+    assert shown.confidence is not None
+    assert float(shown.confidence.max()) == 1
+
+
 def test_soft_layers_share_their_weight(rng) -> None:
     gaussians = random_gaussians(rng, 20)
     camera = camera_at()

@@ -86,10 +86,12 @@ def test_a_floor_a_wall_a_pole_and_a_bush_are_told_apart(rng) -> None:
 def test_heights_are_over_the_lowest_and_below_the_highest() -> None:
     pole = torch.stack((torch.full((30,), 0.25), torch.full((30,), 0.25), torch.arange(30) * 0.1))
     ground = grid(np.arange(-20, 20) * 0.1, np.arange(-20, 20) * 0.1, np.array([-1.0]))
-    found = local_shapes(torch.cat((pole.T.double(), ground)), UP)
+    # A hole in the column beside the pole's, and a deeper one two columns away.
+    holes = torch.tensor([[0.75, 0.25, -2.0], [1.25, 0.25, -7.0]]).double()
+    found = local_shapes(torch.cat((pole.T.double(), ground, holes)), UP)
     # Of the narrow columns the first three, behind the two shapes of six numbers.
     around, own, below = found.features[20, 12:15].tolist()
-    assert around == pytest.approx(3.0, abs=1e-5)
+    assert around == pytest.approx(4.0, abs=1e-5)
     assert own == pytest.approx(3.0, abs=1e-5)
     assert below == pytest.approx(0.9, abs=1e-5)
 

@@ -630,6 +630,14 @@ def test_boxes_of_gaussians_leave_floaters_out(rng) -> None:
     assert found.gap(0, 2) == found.gap(2, 0)
 
 
+def test_boxes_of_flat_things_leave_floaters_out(rng) -> None:
+    sheet = rng.uniform(-1, 1, (400, 3)) * (1, 1, 0)
+    sheet[:4, 0] = 50.0
+    rows = torch.zeros(400, dtype=torch.int64)
+    found = object_geometry(gaussians_at(sheet), rows, up=(0.0, 0.0, 1.0))
+    assert found.side[0] == pytest.approx([1.9, 1.9, 0], abs=0.15)
+
+
 def test_up_of_the_scene_becomes_z() -> None:
     """y is up: what lies above another along y is above it, for the viewer, too."""
     low, high = at(0, 0, 0), at(0, 0, 1)

@@ -356,6 +356,15 @@ def test_masks_of_a_pixel(rng, views) -> None:
         MaskTargets(none, ["v0"])
 
 
+def test_masks_of_other_views_or_sizes_have_another_fingerprint() -> None:
+    """Whole views, whose run lengths are alike."""
+    lying, standing = (MaskSet.from_dense(torch.ones(1, *size) > 0) for size in ((3, 4), (4, 3)))
+    given = [{"a": lying}, {"b": lying}, {"a": standing}]
+    prints = [MaskTargets(Masks(masks), [*masks]).fingerprint for masks in given]
+    assert len(set(prints)) == 3
+    assert MaskTargets(Masks(given[0]), ["a"]).fingerprint == prints[0]
+
+
 def test_a_view_without_labels_gives_no_pixels(rng, views) -> None:
     gaussians = random_gaussians(rng)
     maps = dict(random_maps(rng, views, IDS).maps)

@@ -224,6 +224,15 @@ def test_a_steep_view_keeps_its_own_roll() -> None:
         )
 
 
+def test_half_way_to_steep_half_the_roll_is_kept() -> None:
+    """The sine to up is 0.3, in the middle of 0.15 and 0.45: up bisects level and the camera's."""
+    eye = np.array([1.0, 2.0, 3.0])
+    target = eye + np.array([0.3, 0.0, -math.sqrt(1 - 0.3**2)])
+    (found,) = camera_path(views_of([looking(eye, target, roll=0.4)]), frames=1, up=UP)
+    expected = looking(eye, target, roll=0.2).cam_from_world
+    torch.testing.assert_close(found.cam_from_world, expected, atol=1e-9, rtol=0)
+
+
 def test_few_views_and_few_frames() -> None:
     one = views_of([looking((0, 0, 1), (1, 1, 1))])
     for path in (camera_path(one, frames=5), camera_path(one * 3, frames=5, up=UP)):

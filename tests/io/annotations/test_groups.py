@@ -107,6 +107,21 @@ def test_results_of_one_id_are_one_area_with_its_label(tmp_path: Path) -> None:
         assert int(found.as_kind("labels").label_map("000").ids.max()) == 1
 
 
+def test_an_area_without_a_label_is_of_no_class(tmp_path: Path) -> None:
+    rows = [outline(LEFT, id="a", type="polygon", value={}), outline(RIGHT, id="b")]
+    found = open_annotations(tasks(tmp_path, annotations=[{"result": rows}]), views=VIEWS)
+    assert isinstance(found, AnnotationEvidence)
+    ids = found.as_kind("labels").label_map("000").ids
+    assert ids[0, [0, 30, 63]].tolist() == [-1, -1, 1]
+
+
+def test_a_mask_of_cvat_may_have_one_row(tmp_path: Path) -> None:
+    mask = '<mask label="car" rle="1, 2" left="4" top="5" width="3" height="1"/>'
+    image = f'<image id="0" name="000.jpg" width="64" height="48">{mask}</image>'
+    (tmp_path / "a.xml").write_text(f"<annotations>{image}</annotations>")
+    assert [mask.bbox for mask in masks(tmp_path).masks] == [(5, 5, 2, 1)]
+
+
 def test_soft_edges_of_a_brush_count_from_half(tmp_path: Path) -> None:
     """One run of 127, one of 128 opaque, the rest nothing: (r, g, b, alpha) row by row."""
     alphas = np.zeros(64 * 48, int)

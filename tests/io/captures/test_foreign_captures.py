@@ -16,8 +16,10 @@ import pytest
 import torch
 
 from splatseg.core import Gaussians, Scene
+from splatseg.core.json_values import MAX_NUMBER
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.io.captures import read_capture
+from splatseg.io.captures.raw_views import checked_pose
 from splatseg.io.scene import load_scene, save_scene
 
 NAMES = tuple(f"images/{i:02d}.png" for i in range(8))
@@ -74,6 +76,16 @@ def test_photographs_in_the_folders_of_the_capture(nerfstudio, write_image, list
     assert capture.views[0].mask == folder / there
     assert [view.name for view in capture.views] == [Path(name).stem for name in NAMES]
     assert capture.notes[0].startswith("photographs were read from images, as they are not where")
+
+
+def test_half_of_the_photographs_in_a_folder_of_the_capture_are_enough(
+    nerfstudio, write_image
+) -> None:
+    folder = nerfstudio(("/home/x/0.png", "/home/x/1.png"), images=False)
+    write_image(folder / "images/1.png")
+    capture = read_capture(folder)
+    assert [view.image for view in capture.views] == [folder / "images/1.png"]
+    assert any(note.startswith("photographs were read from images,") for note in capture.notes)
 
 
 def test_folders_that_tell_photographs_apart_are_kept(nerfstudio, write_image) -> None:
@@ -218,6 +230,14 @@ def broken(pose: np.ndarray, kind: str) -> list[list[object]]:
     else:
         pose[1, 3] = {"nan": math.nan, "infinite": math.inf, "null": None}[kind]
     return pose.tolist()
+
+
+def test_a_pose_is_as_far_away_as_numbers_go_and_no_farther() -> None:
+    pose = np.eye(4)
+    pose[0, 3] = -MAX_NUMBER
+    assert checked_pose(pose, where="a").tolist() == pose.tolist()
+    with pytest.raises(InputError, match=r"a: expected a pose of numbers up to 1e\+30, got more"):
+        checked_pose(pose * [1, 1, 1, 2], where="a")
 
 
 @pytest.mark.parametrize("kind", ["nan", "infinite", "null", "singular", "twice as large"])

@@ -101,7 +101,8 @@ def test_without_vehicle_poses_the_first_photograph_tells_the_origin(tmp_path) -
 def test_a_segment_of_several_is_named_by_a_file(tmp_path) -> None:
     write_segment(tmp_path)
     write_segment(tmp_path, context=OTHER)
-    with pytest.raises(InputError, match=r"expected one segment, got 2; name one by its file"):
+    told = r"expected one segment, got 2; name one by its file, such as .*camera_image/.*\.parquet"
+    with pytest.raises(InputError, match=told):
         read_capture(tmp_path)
     for component in ("camera_image", "vehicle_pose"):
         path = tmp_path / component / f"{OTHER}.parquet"

@@ -288,6 +288,7 @@ def changed(tmp_path, change, layer="soft"):
         (lambda h, a: a.pop("ids"), "an array 'ids', which is not there"),
         (lambda h, a: a.pop("shares"), "an array 'shares', which is not there"),
         (lambda h, a: a.update(ids=a["ids"].astype(float)), "'ids' of type i4"),
+        (lambda h, a: a["ids"].__setitem__(1, -1), r"'ids' of 0 \(none\) or more, got -1"),
         (lambda h, a: a.update(confidence=a["confidence"][:, None]), "'confidence' of type f4"),
     ],
 )

@@ -104,6 +104,14 @@ def test_points_of_an_npz(tmp_path) -> None:
     assert read_surface(path, zero_is_class=True).labels["semantic"].tolist() == [1, 2, 3, 4, -1]
 
 
+def test_the_largest_id_has_room_for_one_more(tmp_path) -> None:
+    """Ids grow by 1 where 0 is a class, and end at those of 31 bits."""
+    ids = ("uint", "label", [2**31 - 2] * 5)
+    path = write_ply({"vertex": [*AXES, ids]}, tmp_path / "a.ply")
+    assert read_surface(path).labels["label"].tolist() == [2**31 - 2] * 5
+    assert read_surface(path, zero_is_class=True).labels["label"].tolist() == [2**31 - 1] * 5
+
+
 LABEL = ("int", "label", [1] * 5)
 
 
@@ -123,7 +131,7 @@ LABEL = ("int", "label", [1] * 5)
             "1 of 15 values are not finite",
         ),
         ({"vertex": [*AXES, ("float", "label", [1.5] * 5)]}, "whole ids"),
-        ({"vertex": [*AXES, ("uint", "label", [2**32 - 1] * 5)]}, "ids up to"),
+        ({"vertex": [*AXES, ("uint", "label", [2**31 - 1] * 5)]}, "ids up to 2147483646"),
     ],
 )
 def test_files_that_cannot_be_are_refused_by_name(tmp_path, elements, words) -> None:

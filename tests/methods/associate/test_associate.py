@@ -18,8 +18,15 @@ from splatseg.core import (
     View,
 )
 from splatseg.errors import InputError, RangeError, ShapeError
+from splatseg.io.evidence import create_evidence, open_evidence, save_masks
 from splatseg.lift import ConfusionOptions
-from splatseg.methods.associate import DEFAULT_CONFUSION, AssociateOptions, associate
+from splatseg.methods import MethodInputs
+from splatseg.methods.associate import (
+    DEFAULT_CONFUSION,
+    AssociateMethodOptions,
+    AssociateOptions,
+    associate,
+)
 from splatseg.methods.associate._clustering import _Candidates, join_pairs, shared_masses
 from splatseg.methods.associate._table import SegmentTable, segment_table
 from splatseg.methods.associate._votes import majority
@@ -333,6 +340,25 @@ def test_confusion_is_corrected_unless_told_otherwise(monkeypatch) -> None:
     assert told.info.edit("correct_confusion") == {"a": 1}
     assert plain.info.edits == ()
     assert (told.candidates, plain.candidates) == (None, None)
+
+
+def test_the_method_corrects_confusion_unless_told_otherwise(monkeypatch, tmp_path) -> None:
+    module = importlib.import_module("splatseg.methods.associate")
+    labels, given = run(clean(NAMES)), []
+
+    def associated(*_, confusion, **__):
+        given.append(confusion)
+        return labels
+
+    monkeypatch.setattr(module, "associate", associated)
+    three = ConfusionOptions(effective_views=3)
+    create_evidence(tmp_path, kind="masks")
+    save_masks(MaskSet.from_dense(torch.ones(1, 32, 64) > 0), tmp_path, "v0")
+    inputs = MethodInputs(gaussians=GAUSSIANS, views=VIEWS, evidence=open_evidence(tmp_path))
+    for wanted in (True, False):
+        options = AssociateMethodOptions(correct_confusion=wanted, confusion=three)
+        assert module.run(inputs, options) is labels
+    assert given == [three, None]
 
 
 def test_relabelling_counts_no_more_views_than_saw_a_gaussian(monkeypatch) -> None:

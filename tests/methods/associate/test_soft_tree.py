@@ -7,6 +7,8 @@ import torch
 from splatseg.core import InstanceTree, Labels, MaskSet, TreeNode
 from splatseg.io.layers import load_layer, save_layer
 from splatseg.methods.associate import associate
+from splatseg.methods.associate._memberships import painted
+from splatseg.methods.associate._table import segment_table
 from support.wall import SKY_ROWS, camera, wall
 
 
@@ -65,6 +67,18 @@ def test_a_tree_has_shares_and_its_cuts_have_them(views) -> None:
     ids, counts = cut.ids[left & named].unique(return_counts=True)
     assert counts.max() / counts.sum() > 0.99
     assert len(ids) <= 2
+
+
+def test_maps_that_memberships_are_fitted_to_have_the_smallest_object_on_top(views) -> None:
+    """The quarter is the object 0, the left half the object 1, the right one is none."""
+    fields = Fields(views)
+    table = segment_table(wall(), views, fields, longest_side=640, backend="auto")
+    found = painted(table, np.array([1, -1, 0])[table.name], fields, 640)
+    for view in views:
+        masks = fields.segments_of(view.name)
+        expected = torch.where(masks.dense(0), 1, -1)
+        expected[masks.dense(2)] = 0
+        assert torch.equal(found(view).ids, expected.int())
 
 
 def test_without_memberships_a_tree_is_hard(views) -> None:

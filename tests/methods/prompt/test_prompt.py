@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -156,6 +157,32 @@ def test_lifting_and_tolerance_matter(fruit, monkeypatch) -> None:
     for found in (weight, centre):
         away = (found - torch.tensor([-0.5, 0.0, 2.5], dtype=torch.float64)).norm(dim=1)
         assert float(away.max()) < 0.25
+
+
+def test_a_thing_covers_in_each_view_what_its_mask_does(fruit) -> None:
+    """Of points by hand nobody knows what they are of."""
+    options = PromptOptions()
+    found = fruit.session().find("apple")[0]
+    points = select.sampled_points(found, "apple", options, seed=0)
+    by_hand = [replace(one, area=None) for one in points]
+    given = [("apple", points), ("points", by_hand)]
+    known, unknown = select.world_prompts(fruit.gaussians, given, options, backend="auto")
+    assert len(found.masks) == 9
+    for view, rle in found.masks:
+        assert known.area_in(view) == pytest.approx(rle.area, rel=0.3)
+        assert unknown.area_in(view) is None
+    assert unknown.size is None
+
+
+def test_things_of_one_word_draw_points_of_their_own(fruit) -> None:
+    session = fruit.session(sampling="random", rounds=1)
+    found = session.find("apple")[0]
+    made = session.select([found, found, found])
+    for rank, one in enumerate(made.objects):
+        key, options = f"apple/{rank}", PromptOptions(sampling="random")
+        expected = select.sampled_points(found, key, options, seed=0)
+        for own, other in zip(one.points, expected, strict=True):
+            assert torch.equal(own.pixels, other.pixels)
 
 
 def test_points_by_hand_are_one_object(fruit) -> None:

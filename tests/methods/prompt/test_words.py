@@ -48,6 +48,19 @@ def test_masks_of_one_thing_share_gaussians(fruit, table) -> None:
     assert set(apples) < set(half)
 
 
+def test_masks_that_hold_no_gaussian_look_like_nothing(fruit) -> None:
+    """Of the pear alone, the half of the apple that comes last in every view is one."""
+    pear = fruit.gaussians[fruit.ids == PEAR]
+    table = mask_table(pear, fruit.views[3:6], fruit.features, fruit.masks)
+    assert table.looks is not None
+    pears, apples = rows_of(fruit, table, PEAR), rows_of(fruit, table, APPLE)
+    assert int(table.index.max()) == 4
+    assert bool((table.iou.diagonal()[pears] > 0).all())
+    assert not bool(table.iou[apples].any())
+    assert bool(table.looks.low[pears].isfinite().all())
+    assert not bool(table.looks.low[apples].isfinite().any())
+
+
 def test_features_of_small_things_are_not_those_of_the_wall(fruit, table) -> None:
     words = vectors()
     for id in (APPLE, PEAR):

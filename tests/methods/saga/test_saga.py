@@ -158,6 +158,31 @@ def test_what_goes_with_guidance(walls, monkeypatch) -> None:
             assert not torch.equal(published(), usual), name
 
 
+def test_without_guidance_nothing_is_asked_to_be_sparse(walls, monkeypatch) -> None:
+    """Sparsity is of products with queries, which guidance alone has."""
+    paper = SagaOptions.published(steps=3, guidance=None)
+    options = replace(paper, guidance_weight=0.0, grid=8)
+
+    def values() -> torch.Tensor:
+        return train_saga(
+            walls.gaussians, walls.views, walls.evidence, options=options, context=context()
+        ).values
+
+    usual = values()
+    monkeypatch.setattr("splatseg.methods.saga.model._SPARSITY_WEIGHT", 10.0)
+    assert torch.equal(values(), usual)
+
+
+def test_features_without_a_gate_are_scored(walls) -> None:
+    """There are no levels then, and every mask is asked for."""
+    options = replace(SagaOptions.published(steps=3, guidance=None), grid=8, held_out=0.4)
+    details = train_saga(
+        walls.gaussians, walls.views, walls.evidence, options=options, context=context()
+    ).info.details
+    assert details["scores"]
+    assert all(0 < score < 1 for _, score in details["scores"])
+
+
 def test_early_stopping_keeps_the_best(walls, monkeypatch) -> None:
     monkeypatch.setattr("splatseg.methods.saga.options._SCORE_EVERY", 5)
     details = trained(walls, held_out=0.4, steps=200, rate=0.5).info.details

@@ -1,5 +1,6 @@
 """Features of pixels summed onto voxels, against twins, identities and scenes solved by hand."""
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from methods.voxels import reference
 from splatseg import _native
 from splatseg.core import UNLABELLED, FeatureMap, Labels, View
 from splatseg.core.sh import base_colours
+from splatseg.core.voxels import VoxelGrid
 from splatseg.errors import InputError, ShapeError
 from splatseg.lift import label_map
 from splatseg.lift.neighbour_graph import NodeAttributes, neighbour_graph
@@ -172,6 +174,22 @@ def test_the_nearest_voxel_by_hand() -> None:
     assert nearest_voxels(grid, points).tolist() == [0, 1, 0, 1, 1]
 
 
+def test_the_first_voxel_of_a_ray_gets_what_its_pixel_shows() -> None:
+    """Two voxels side by side before the camera, and a third behind the left one, out of sight."""
+    points = torch.tensor([[-2.0, -1.0, 3.0], [0.5, 0.0, 3.5], [-1.0, 0.0, 5.5]])
+    grid = voxelise(points, 2.0)
+    left, right, behind = nearest_voxels(grid, points).tolist()
+    view = view_at("v", 0.0)
+    view = replace(view, camera=replace(view.camera, fx=12.0, fy=12.0))
+    columns = torch.tensor([1.0, 1, 0, 0])[None, :, None].expand(3, 4, 1)
+    features = Grids({"v": FeatureMap(features=columns, stride=4, height=12, width=16)})
+    found = lift((gaussians_at(points), grid, [view], features), hits="first")
+    # 8 columns each and rows 2 to 9; from cell to cell 7/8, 5/8, 3/8 and 1/8.
+    assert found.totals[[left, right, behind]].tolist() == [64, 64, 0]
+    expected = torch.tensor([[7.5 / 8], [0.5 / 8], [0]])
+    torch.testing.assert_close(found.values[[left, right, behind]], expected)
+
+
 def test_what_is_no_surface_is_left_out(monkeypatch) -> None:
     """One Gaussian breaks each rule; the others are a sheet."""
     x, y = torch.meshgrid(torch.arange(6.0), torch.arange(6.0), indexing="ij")
@@ -299,6 +317,25 @@ def test_two_in_one_cell_are_told_apart(monkeypatch) -> None:
     mixed = uplift_features(gaussians, views, two[3], backend=BACKEND).values[rows.argsort()]
     assert float((apart - true).abs().max()) < 0.1
     assert float((mixed - true).abs().max()) > 0.2
+
+
+def test_two_halves_of_a_wall_draw_on_each_other_by_hand(monkeypatch) -> None:
+    """Each makes 6 whole cells, which show 1 and -1: (6 + 0.05 + 0.7 w) x - 0.7 w (-x) = 6.
+
+    The strength w is exp(-1/2) of two that are each other's farthest neighbour and of one colour.
+    """
+    view = view_at("v", 0.0)
+    rays = view.camera.rays()[1].reshape(-1, 3)  # a small Gaussian in the middle of each pixel
+    gaussians = gaussians_at(4 * rays / rays[:, 2:], scale=0.05)
+    cells = torch.tensor([[0, 0, 0], [1, 0, 0]])
+    grid = VoxelGrid(cells=cells, size=4.0, origin=torch.tensor([-4.0, -2.0, 2.0]))
+    columns = torch.tensor([1.0, 1, -1, -1])[None, :, None].expand(3, 4, 1)
+    features = Grids({"v": FeatureMap(features=columns, stride=4, height=12, width=16)})
+    monkeypatch.setattr("splatseg.methods.voxels.lifting.BLUR", 0.0)
+    found = lift((gaussians, grid, [view], features))
+    assert found.totals.tolist() == pytest.approx([6, 6])
+    own = 6 / (6.05 + 2 * 0.7 * math.exp(-0.5))
+    assert found.values[:, 0].tolist() == pytest.approx([own, -own], abs=1e-3)
 
 
 def test_progress_counts_views_and_parts_of_channels(scene, monkeypatch) -> None:
