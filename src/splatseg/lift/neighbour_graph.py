@@ -246,7 +246,7 @@ def diffuse(
     free_rows, clamped_rows = np.flatnonzero(~known), np.flatnonzero(known)
     if not len(free_rows):
         return shares
-    transition.sort_indices()
+    transition.sort_indices()  # so that sums do not depend on the order of what came
     # The part of known neighbours never changes.
     source = (transition[:, clamped_rows] @ shares[clamped_rows]).tocsr()
     free_transition = transition[:, free_rows].tocsr()

@@ -58,7 +58,7 @@ def is_compressed(header: PlyHeader) -> bool:
     return vertex is not None and "packed_position" in vertex.names
 
 
-def read_compressed_ply(path: Path, *, strict: bool = False) -> Gaussians:
+def read_compressed_ply(path: Path, *, strict: bool) -> Gaussians:
     """Read a compressed PLY file.
 
     Raises:

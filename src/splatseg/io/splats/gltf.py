@@ -143,7 +143,7 @@ class _Document:
     extensionsRequired: list[str] = field(default_factory=list[str])
 
 
-def read_gltf(path: Path, *, strict: bool = False) -> Gaussians:
+def read_gltf(path: Path, *, strict: bool) -> Gaussians:
     """Read all Gaussians of the default scene, in world coordinates.
 
     Harmonics are padded with zeros to the highest degree in the file. Colours stay as they

@@ -169,7 +169,7 @@ def read_ply(
     path: Path,
     header: PlyHeader,
     *,
-    strict: bool = False,
+    strict: bool,
     linear: Collection[str] = (),
     own: bool = False,
 ) -> Gaussians:

@@ -110,7 +110,7 @@ class _Document:
     model: Any = None
 
 
-def read_sog(path: Path, *, strict: bool = False) -> Gaussians:
+def read_sog(path: Path, *, strict: bool) -> Gaussians:
     """Read a bundled ``.sog`` file, or an unbundled one by its ``meta.json`` or its folder.
 
     Raises:

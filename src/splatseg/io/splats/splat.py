@@ -40,7 +40,7 @@ _SPLAT = np.dtype(
 )
 
 
-def read_splat(path: Path, *, strict: bool = False) -> Gaussians:
+def read_splat(path: Path, *, strict: bool) -> Gaussians:
     """Read a ``.splat`` file.
 
     Raises:
@@ -154,7 +154,7 @@ class _Section:
         )
 
 
-def read_ksplat(path: Path, *, strict: bool = False) -> Gaussians:
+def read_ksplat(path: Path, *, strict: bool) -> Gaussians:
     """Read a ``.ksplat`` file of version 0.1, of any compression level.
 
     Raises:

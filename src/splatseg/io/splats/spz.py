@@ -70,7 +70,7 @@ class _Header:
         return (9, 1, 3, 3, rotation, rest) if rest else (9, 1, 3, 3, rotation)
 
 
-def read_spz(path: Path, *, strict: bool = False) -> Gaussians:
+def read_spz(path: Path, *, strict: bool) -> Gaussians:
     """Read an SPZ file of version 2, 3 or 4, turned to the axes of PLY files.
 
     Extensions (limits for a viewer's camera, for example) are not kept; the flag of a file made
