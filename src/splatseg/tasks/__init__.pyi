@@ -62,7 +62,6 @@ from .select_text import text_prompts as text_prompts
 from .sharpen import SharpenedScene as SharpenedScene
 from .sharpen import SharpenSceneOptions as SharpenSceneOptions
 from .sharpen import sharpen_scene as sharpen_scene
-from .sources import QueryOptions as QueryOptions
 from .sources import SelectMode as SelectMode
 from .sources import SelectOptions as SelectOptions
 from .street_drive import StreetDrive as StreetDrive
@@ -77,5 +76,6 @@ from .street_scene import StreetScene as StreetScene
 from .street_scene import make_street_field as make_street_field
 from .street_scene import street_field_of_scene as street_field_of_scene
 from .street_scene import street_scene as street_scene
+from .word_sources import QueryOptions as QueryOptions
 from .work import SILENT as SILENT
 from .work import Observer as Observer

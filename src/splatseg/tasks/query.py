@@ -28,7 +28,7 @@ from splatseg.lift.words import WordIndex, WordMatches
 from splatseg.methods.voxels.words import VoxelWords
 from splatseg.render import BackendName
 from splatseg.selection import components
-from splatseg.tasks.sources import QueryOptions, word_source
+from splatseg.tasks.word_sources import QueryOptions, word_source
 from splatseg.tasks.work import SILENT, Observer, Work, versions
 
 # Words asked of a scene: which things answer to them, and how surely.

@@ -24,13 +24,8 @@ from splatseg.prompting.seen import ViewCache
 from splatseg.render import BackendName
 from splatseg.tasks.query import QueryResult, QuerySession, reference_record
 from splatseg.tasks.select import Selected, check_base, combined, prompt_record, within
-from splatseg.tasks.sources import (
-    STEPS,
-    QueryOptions,
-    SelectOptions,
-    feature_evidence,
-    mask_name,
-)
+from splatseg.tasks.sources import STEPS, SelectOptions
+from splatseg.tasks.word_sources import QueryOptions, feature_evidence, mask_name
 from splatseg.tasks.work import SILENT, Observer, Work, layer_versions
 
 # Prompts as the record of a layer holds them.

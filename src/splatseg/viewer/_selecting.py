@@ -36,7 +36,8 @@ from splatseg.prompting.seen import ViewCache
 from splatseg.render import BackendName
 from splatseg.tasks.query import QuerySession
 from splatseg.tasks.select import SelectionSession, open_selector, prompt_record
-from splatseg.tasks.sources import QueryOptions, SelectOptions
+from splatseg.tasks.sources import SelectOptions
+from splatseg.tasks.word_sources import QueryOptions
 from splatseg.tasks.work import Observer, Work
 from splatseg.viewer._colour_source import ColourSource
 from splatseg.viewer._products import METHOD
