@@ -77,35 +77,55 @@ class PairRows:
 
 
 def record_pairs(
-    examples: Iterable[Example], pair: Perceptron | None, *, seed: int, share: float = 0.1
+    examples: Sequence[Example],
+    pair: Perceptron | None,
+    *,
+    seed: int,
+    share: float = 0.1,
+    over: Callable[[Callable[[int], Any], range], Iterable[Any]] = map,
 ) -> PairRows:
     """Merge by what was learned so far, by contours alone at first, and keep what was asked.
 
     What a policy meets is what it must learn, so each round follows the last one's (Ross et al.
     2011; of regions, GALA of Nunez-Iglesias et al. 2013). Each picture is merged in an order of
     parts, of things, or between. Regions that are of several count little.
+
+    Args:
+        examples: Pictures.
+        pair: What was learned so far.
+        seed: Of the orders, and of what is kept.
+        share: Of questions that are kept.
+        over: Applies a function to numbers of examples, in order; by several processes, say.
     """
-    rng = np.random.default_rng(seed)
-    rows: list[tuple[Array, NDArray[np.bool_], Array]] = []
-    for example in examples:
-        thing = float(rng.choice([0.0, 0.5, 1.0]))
-        tree = merge(example.regions, pair, (1 - thing, thing), record=True)
-        if tree.questions is None:
-            raise RuntimeError("merging recorded nothing.")
-        pairs, features = tree.questions
-        kept = rng.random(len(pairs)) < share
-        a, b = pairs[kept].T
-        least = np.minimum(np.minimum(tree.area[a], tree.area[b]), 4000) ** 0.5
-        same: list[NDArray[np.bool_]] = []
-        weights: list[Floats] = []
-        for ids in (example.part, example.thing):
-            totals = _with_unions(counts(example.basins, ids), tree)
-            main, most = totals.argmax(1), totals.max(1) / tree.area
-            same.append(main[a] == main[b])
-            weights.append(least * (2 * np.minimum(most[a], most[b]) - 1).clip(0))
-        rows.append((features[kept], np.stack(same, 1), np.stack(weights, 1).astype(np.float32)))
+
+    def one(number: int) -> tuple[Array, NDArray[np.bool_], Array]:
+        return _recorded(examples[number], pair, np.random.default_rng([seed, number]), share)
+
+    rows = list(over(one, range(len(examples))))
     features, answers, weights_of_all = (np.concatenate(part) for part in zip(*rows, strict=True))
     return PairRows(features=features, answers=answers, weights=weights_of_all)
+
+
+def _recorded(
+    example: Example, pair: Perceptron | None, rng: np.random.Generator, share: float
+) -> tuple[Array, NDArray[np.bool_], Array]:
+    """Features, answers and weights of one picture, as of `PairRows`."""
+    thing = float(rng.choice([0.0, 0.5, 1.0]))
+    tree = merge(example.regions, pair, (1 - thing, thing), record=True)
+    if tree.questions is None:
+        raise RuntimeError("merging recorded nothing.")
+    pairs, features = tree.questions
+    kept = rng.random(len(pairs)) < share
+    a, b = pairs[kept].T
+    least = np.minimum(np.minimum(tree.area[a], tree.area[b]), 4000) ** 0.5
+    same: list[NDArray[np.bool_]] = []
+    weights: list[Floats] = []
+    for ids in (example.part, example.thing):
+        totals = _with_unions(counts(example.basins, ids), tree)
+        main, most = totals.argmax(1), totals.max(1) / tree.area
+        same.append(main[a] == main[b])
+        weights.append(least * (2 * np.minimum(most[a], most[b]) - 1).clip(0))
+    return features[kept], np.stack(same, 1), np.stack(weights, 1).astype(np.float32)
 
 
 def _with_unions(of_basins: Array, tree: Hierarchy) -> Array:
@@ -118,19 +138,28 @@ def _with_unions(of_basins: Array, tree: Hierarchy) -> Array:
     return found
 
 
-def node_rows(examples: Iterable[Example], pair: Perceptron) -> tuple[Array, Array]:
+def node_rows(
+    examples: Sequence[Example],
+    pair: Perceptron,
+    *,
+    over: Callable[[Callable[[int], Any], range], Iterable[Any]] = map,
+) -> tuple[Array, Array]:
     """Features (n, f) of candidates, and what their perceptron is to say (n, 4).
 
     The IoU with the best part and the best thing, and twice what each is above a half.
     """
-    found: list[tuple[Array, Array]] = []
-    for example in examples:
+
+    def one(number: int) -> tuple[Array, Array]:
+        example = examples[number]
         nodes = candidates(example.regions, pair)
         best = [
             best_ious(nodes, example.basins, ids).max(1) for ids in (example.part, example.thing)
         ]
-        found.append((nodes.features, np.stack(best, axis=1)))
-    features, ious = (np.concatenate(part) for part in zip(*found, strict=True))
+        return nodes.features, np.stack(best, axis=1)
+
+    features, ious = (
+        np.concatenate(part) for part in zip(*over(one, range(len(examples))), strict=True)
+    )
     return features, np.concatenate((ious, (2 * ious - 1).clip(0)), axis=1)
 
 

@@ -38,7 +38,7 @@ BOX_SCALE = 8.0
 """Pixels at which distances d to a box's sides go from linear to logarithmic: the network gives
 log(1 + d / 8)."""
 
-_WIDTHS, _DECODED = (20, 32, 56, 96, 160), 40
+_WIDTHS, _DECODED = (20, 32, 72, 144, 256), 40
 _MEAN, _SPREAD = 0.45, 0.25
 _STRIDE = 32
 _MIRRORED = (0, 1, 2, 3, 6, 5, 4, 7, 10, 9, 8, 11)

@@ -32,7 +32,7 @@ from splatseg.models.networks._library import BatchedNetwork
 from splatseg.models.regions import RegionOptions as RegionOptions
 from splatseg.models.regions import learned_masks
 
-ALGORITHM = 2
+ALGORITHM = 3
 """Grows when the same settings give other masks, so that cached ones are not taken for new."""
 
 SCALES = (0.5, 1.0, 1.5)

@@ -21,7 +21,7 @@ from splatseg.models._region_masks import masks_of_regions, with_depth, with_hed
 from splatseg.models._region_network import contours_and_boxes, region_network
 from splatseg.models._regions import WORKING_SIZE, reduced
 
-ALGORITHM = 2
+ALGORITHM = 3
 """Grows when the same settings give other masks, so that cached ones are not taken for new."""
 
 
