@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from splatseg.models._region_graph import described, merge, regions
+from splatseg.models._region_graph import Perceptron, described, merge, regions
 from splatseg.models._region_masks import candidates
 from splatseg_bench.region_merging import (
     Example,
@@ -199,3 +199,25 @@ def test_depth_as_rendered_is_noisy_where_there_is_something() -> None:
     assert 0 < float(np.abs(inside / 2 - 1).max()) < 0.2
     assert float(found[:, 50:].max()) == 0
     assert np.isfinite(found).all()
+
+
+def test_pictures_are_met_alone_and_by_whoever_maps_them() -> None:
+    """What is kept of a picture depends on its number, not on what was met before it."""
+    numbers: list[int] = []
+
+    def backwards(one, those):
+        numbers.extend(those)
+        return [one(number) for number in those[::-1]][::-1]
+
+    two = [example(), example()]
+    plain, other = (record_pairs(two, None, seed=0, over=over) for over in (map, backwards))
+    np.testing.assert_array_equal(other.features, plain.features)
+    np.testing.assert_array_equal(other.answers, plain.answers)
+    pair = Perceptron(
+        scaling=np.stack((plain.features.mean(0), plain.features.std(0) + 1e-4)),
+        layers=((np.ones((plain.features.shape[1], 2), np.float32), np.zeros(2, np.float32)),),
+    )
+    rows = [node_rows(two, pair, over=over) for over in (map, backwards)]
+    for one, same in zip(*rows, strict=True):
+        np.testing.assert_array_equal(one, same)
+    assert numbers == [0, 1, 0, 1]
