@@ -72,7 +72,7 @@ def refit(
         if view.image is None:
             continue
         found = masks.label_map(view.name).ids
-        mask = torch.isin(found, torch.tensor(ids, dtype=found.dtype))
+        mask = torch.isin(found, torch.tensor(tuple(ids), dtype=found.dtype))
         if not bool(mask.any()):
             continue
         shown.append(view)
