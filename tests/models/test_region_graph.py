@@ -1,6 +1,7 @@
 """Regions: what is summed over them, how they are merged, against the readable twin."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -228,6 +229,9 @@ def test_selection_takes_the_best_that_repeat_nothing() -> None:
     assert select(found, scores, most=2, least=0).tolist() == [1, 3]
     assert select(found, scores, most=9, least=4).tolist() == [1, 2]
     assert select(found, -scores, most=9, least=0).tolist() == [2, 0, 3]
+    # Of 24 pixels the second is all of the image: what is in it is asked for.
+    alone = replace(found, basin_areas=np.array([10, 10, 4, 0], np.float32))
+    assert select(alone, scores, most=9, least=0).tolist()[:2] == [3, 0]
 
 
 def test_masks_are_runs_of_their_regions(rng) -> None:

@@ -38,6 +38,10 @@ SMALLEST = 80 / (512 * 384)
 _AT_ONCE = 256
 """Nodes whose basins are held densely."""
 
+_LARGEST = 0.98
+"""Share of the image that a mask has at most: that it is all one thing says nothing of what is in
+it, and before an even background it is what the nodes' perceptron believes in most."""
+
 REPEATED = 0.6
 """Of candidates whose IoU is larger the better one is taken."""
 
@@ -134,14 +138,18 @@ def _agreement(found: Candidates, tree: int, trees: int) -> Array:
 
 
 def select(found: Candidates, scores: Floats, *, most: int, least: float) -> Rows:
-    """The best `most` candidates of at least `least` pixels of which none repeats a better one."""
+    """The best `most` candidates of at least `least` pixels of which none repeats a better one.
+
+    None is of nearly the whole image.
+    """
+    largest = _LARGEST * float(found.basin_areas.sum())
     taken: list[int] = []
     weighted = np.zeros((most, len(found.basin_areas)), np.float32)
     areas = np.zeros(most, np.float32)
     for i in np.argsort(-scores, kind="stable").tolist():
         if len(taken) == most:
             break
-        if found.areas[i] < least:
+        if not least <= found.areas[i] <= largest:
             continue
         inside = found.members(np.array([i]))[0].astype(np.float32)
         count = len(taken)

@@ -160,7 +160,7 @@ def test_masks_are_made_and_answer_clicks(new_tab, serve, browser_scene, tmp_pat
     assert state["source"] == "layer masks"
     tab.keep(RED, "mug")
     found = tab.serving.objects()[0]
-    assert 130 < found["count"] < 170
+    assert 100 < found["count"] < 160, "of 150; some inside it no view shows"
     assert found["source"] == "layer masks"
     tab.check("test_masks_are_made_and_answer_clicks")
 
