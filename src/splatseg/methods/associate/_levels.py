@@ -35,8 +35,7 @@ def node_levels(
 
     - a part that has parts, :math:`s` for each node below it;
     - an object in a group that has no parts, :math:`s / 2`: small things often show none, whereas
-    parts
-      are hardly ever divided;
+      parts are hardly ever divided;
     - a group, 2: a level more must explain more than two exceptions.
 
     Every path from a root to a leaf has one object or, below the groups, none; its levels go from
