@@ -45,6 +45,7 @@ def separated(
     support: Sequence[float] | None = None,
     min_support: float = 0.3,
     min_views: int = 2,
+    objectness: np.ndarray | None = None,
 ) -> tuple[SegmentTree, list[int]]:
     view = np.array([view for view, _, _ in masks])
     node = np.array([node for _, node, _ in masks])
@@ -62,7 +63,9 @@ def separated(
         alone=np.zeros(count, bool),
     )
     nested = nested_of(share, view)
-    found, level = separated_levels(tree, nested, min_support=min_support, min_views=min_views)
+    found, level = separated_levels(
+        tree, nested, objectness, min_support=min_support, min_views=min_views
+    )
     assert len(level) == len(found.parent) == len(found.size) == len(found.alone)
     return found, level.tolist()
 
@@ -90,6 +93,24 @@ def test_a_shelf_and_the_shelf_with_its_books_are_a_group_and_an_object() -> Non
     assert held[9] == {20}
     assert tree.size.tolist() == [24, 10, 10, 2, 2, 1, 1, 1, 1, 20]
     assert tree.alone.tolist() == [False] * 9 + [True]
+
+
+@pytest.mark.parametrize(
+    ("larger", "unknown", "divided"),
+    [(0.74, False, True), (0.76, False, False), (0.76, True, True)],
+)
+def test_a_larger_one_that_is_a_thing_to_the_model_is_no_group(larger, unknown, divided) -> None:
+    """Masks of a floor with a rim of what lies on it and without are all of the floor."""
+    masks = shelf()
+    objectness = np.array(
+        [larger if len(members) == 24 else 0.9 if node == 0 else 0.2 for _, node, members in masks]
+    )
+    if unknown:
+        objectness[-1] = np.nan
+    tree, level = separated(masks, objectness=objectness)
+    assert (len(tree.parent) == 10) == divided
+    if not divided:
+        assert level == [OBJECT] + [PART] * 8
 
 
 def test_support_and_views_of_the_two_are_those_of_their_masks() -> None:

@@ -91,6 +91,9 @@ def _levels_by_objectness(tree: SegmentTree, objectness: NDArray[np.float64]) ->
     return level
 
 
+_THING = 0.75
+"""Mean objectness from which on masks are of a thing: above it one node at most is that thing."""
+
 _MIN_INSIDE = 0.75
 """h from which on a child lies inside all masks of its parent: half way between the half that
 one of two masks gives and all."""
@@ -119,7 +122,8 @@ def separated_levels(
     a node of their own inside it, beside these children; what lies in all masks is inside the new
     node. The levels say what that is (`node_levels`): a group of an object and its contents, or an
     object of its largest part and the others. An object without one of its parts is neither, and is
-    not divided.
+    not divided. Nor is a node whose larger masks are of a thing to the model: what lies on a floor
+    makes no group of it, and masks that take in some of it are of the floor too.
 
     Args:
         tree: The nodes.
@@ -133,6 +137,8 @@ def separated_levels(
         The tree, new nodes last, and the level of each node as `node_levels` gives it.
     """
     found = _divisions(tree, nested, min_support=min_support, min_views=min_views)
+    if objectness is not None and not np.isnan(objectness).any():
+        found = [one for one in found if not _is_thing(tree, one, objectness)]
     level = node_levels(_divided(tree, found), objectness)
     known, last = level[: len(tree.parent)], level[len(tree.parent) :]
     children = tree.children
@@ -142,6 +148,12 @@ def separated_levels(
     ]
     stays = [division for division, keep in zip(found, kept, strict=True) if keep]
     return _divided(tree, stays), np.append(known, last[np.array(kept, bool)])
+
+
+def _is_thing(tree: SegmentTree, division: "_Division", objectness: NDArray[np.float64]) -> bool:
+    """Whether the larger of the two is a thing to the model, and so no group: then both are it."""
+    outer = np.setdiff1d(np.flatnonzero(tree.node == division.row), division.masks)
+    return float(objectness[outer].mean()) >= _THING
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
