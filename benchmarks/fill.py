@@ -245,7 +245,7 @@ def main() -> None:
     parser.add_argument("capture", type=Path)
     parser.add_argument("scene", type=Path, nargs="?")
     parser.add_argument("--ids", type=int, nargs="+", help="only these things")
-    parser.add_argument("--how", nargs="+", default=["empty", "opencv"])
+    parser.add_argument("--how", nargs="+", default=["empty", "opencv", "exemplar"])
     parser.add_argument("--pictures", type=Path)
     arguments = parser.parse_args()
     if arguments.what == "write":

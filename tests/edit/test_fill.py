@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass, field, replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -19,7 +20,8 @@ from splatseg.edit import (
     find_inpainter,
     replay,
 )
-from splatseg.edit.holes import OpenCvInpainter
+from splatseg.edit.holes import _first_met
+from splatseg.edit.inpainting import ExemplarInpainter, OpenCvInpainter
 from splatseg.errors import InputError, ShapeError
 from splatseg.render import render
 from splatseg.render.cpu import set_threads, threads
@@ -147,6 +149,46 @@ def test_nothing_is_filled_behind_what_hides_nothing(filled) -> None:
     assert len(fill(gaussians, thing, views(), backend=BACKEND).gaussians) == 0
 
 
+def test_unseen_gaussians_of_the_surface_are_replaced() -> None:
+    """A floor under the box that no view ever saw, in a colour by chance."""
+    gaussians, ids, _ = scene_parts()
+    x, y = places(0.2, 0.08)
+    green = sheet(x, y, 0.01, (0.0, 1.0, 0.0), step=0.08)
+    deeper = sheet(x, y, -0.8, (0.0, 1.0, 0.0), step=0.08)
+    everything = Gaussians.concatenate([gaussians, green, deeper])
+    kinds = torch.cat((ids, torch.full((len(green),), BELOW), torch.full((len(deeper),), 4)))
+    found = fill(everything, only(kinds, THING), views(), backend=BACKEND)
+    assert float(found.replaced.mask[kinds == BELOW].float().mean()) > 0.9
+    assert not bool(found.replaced.mask[kinds == 4].any())
+    assert not bool(found.replaced.mask[kinds == THING].any())
+    assert float(found.replaced.mask[kinds == FLOOR].float().mean()) < 0.01
+    # What lies around a hole is counted without the thing and without what is replaced.
+    rest = everything[~(found.replaced.mask | (kinds == THING))]
+    around = rest.means[torch.cat(found.rims)]
+    assert float(around[:, 2].abs().max()) < 0.2
+    assert float(around[:, :2].abs().amax(dim=1).min()) > 0.3
+    colours = 0.5 + SH_C0 * found.gaussians.sh[:, 0]
+    torch.testing.assert_close(colours, torch.tensor(GREY).expand_as(colours), atol=0.05, rtol=0)
+
+
+def test_first_met_walks_against_a_direction() -> None:
+    wanted, other = np.zeros((4, 5), bool), np.zeros((4, 5), bool)
+    wanted[1, 0] = other[1, 3] = True
+    right = np.zeros((4, 5), bool)
+    right[1, :3] = True
+    assert np.array_equal(_first_met(wanted, other, 0, 1), right)
+    down = np.zeros((4, 5), bool)
+    down[1:, 0] = True
+    assert np.array_equal(_first_met(wanted, other, 1, 0), down)
+    slanted = np.zeros((4, 5), bool)
+    slanted[[1, 2, 3], [0, 1, 2]] = True
+    assert np.array_equal(_first_met(wanted, other, 1, 1), slanted)
+    # What leaves the image does not come in again.
+    assert _first_met(wanted, other, 1, -1).sum() == 1
+    assert np.array_equal(_first_met(other, wanted, 0, -1)[1], [False, True, True, True, False])
+    assert _first_met(wanted, other, -1, 0)[:2, 0].all()
+
+
 def test_what_no_view_saw_goes_along() -> None:
     gaussians, ids, _ = scene_parts(under=True)
     found = exposed(gaussians, only(ids, THING), views(), backend=BACKEND)
@@ -184,11 +226,12 @@ def test_another_inpainter_paints(filled) -> None:
 
 def test_inpainters_have_names(monkeypatch) -> None:
     assert find_inpainter("opencv") == OpenCvInpainter()
+    assert find_inpainter("exemplar") == ExemplarInpainter()
     for name in ("classical", "nothing"):
         with pytest.raises(InputError, match=f"fill: .* a model that inpaints, got '{name}'"):
             find_inpainter(name)
-    monkeypatch.setattr("splatseg.edit.holes.model_names", lambda: ("painter",))
-    monkeypatch.setattr("splatseg.edit.holes.find_model", lambda _: Painter())
+    monkeypatch.setattr("splatseg.edit.inpainting.model_names", lambda: ("painter",))
+    monkeypatch.setattr("splatseg.edit.inpainting.find_model", lambda _: Painter())
     assert find_inpainter("painter") == Painter()
 
 

@@ -14,7 +14,7 @@ from splatseg.edit.holes import Filled as Filled
 from splatseg.edit.holes import exposed as exposed
 from splatseg.edit.holes import fill as fill
 from splatseg.edit.holes import filled_layer as filled_layer
-from splatseg.edit.holes import find_inpainter as find_inpainter
+from splatseg.edit.inpainting import find_inpainter as find_inpainter
 from splatseg.edit.operations import duplicate as duplicate
 from splatseg.edit.operations import extract as extract
 from splatseg.edit.operations import merge as merge

@@ -62,7 +62,7 @@ class FillBy:
     views: tuple[str, ...]
     """Names of the views that saw the scene."""
 
-    inpainter: str = "opencv"
+    inpainter: str = "exemplar"
     """Name of the model that paints them, see `find_inpainter`."""
 
 

@@ -14,7 +14,8 @@ import torch
 from splatseg.core import Edited, Gaussians, Scene, Selection, Similarity, View
 from splatseg.core.boundary import boundary
 from splatseg.edit.document import HISTORY, Document, FillBy, Operation, Recolour, load_document
-from splatseg.edit.holes import exposed, fill, filled_layer, find_inpainter
+from splatseg.edit.holes import exposed, fill, filled_layer
+from splatseg.edit.inpainting import find_inpainter
 from splatseg.edit.operations import (
     duplicate,
     extract,
@@ -117,13 +118,16 @@ def _removed_and_filled(
         backend=backend,
         progress=progress,
     )
-    after = document.edited(remove(gaussians, removed))
+    after = document.edited(remove(gaussians, removed | found.replaced))
     joined = Gaussians.concatenate([after.scene.gaussians, found.gaussians])
     filled = Document(
         scene=replace(after.scene, gaussians=joined),
         layers={name: filled_layer(layer, found, joined) for name, layer in after.layers.items()},
     )
-    return filled, {"exposed": uncertain.count, "filled": len(found.gaussians)}
+    return filled, {
+        "exposed": uncertain.count + found.replaced.count,
+        "filled": len(found.gaussians),
+    }
 
 
 def _merged(document: Document, other: Document, moved: Similarity | None) -> Document:

@@ -2,27 +2,24 @@
 
 What a thing hid is found in 3D and not in pictures: planes are fitted to what is visible around it,
 and a cell of such a plane is filled if a view now looks at it through the removed thing, no view
-saw it or through it, and the plane was seen along most of the border of the hole. A plane's own
-Gaussians are rendered from straight above it, that one image is inpainted, and each of its cells
-in the hole becomes a flat Gaussian. One image a plane, seen by all views, cannot disagree between
-views.
+saw it or through it, and the plane was seen around it in most directions. What views show of the
+plane makes one image as from straight above it, that image is inpainted, and each of its cells in
+the hole becomes a flat Gaussian in place of those that lie there unseen. One image a plane, seen by
+all views, cannot disagree between views.
 
 References:
     Schnabel et al., Efficient RANSAC for Point-Cloud Shape Detection, CGF 2007: hypotheses from
     local samples, the largest plane first.
-    Telea, An Image Inpainting Technique Based on the Fast Marching Method, JGT 2004.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, cast
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Int64, UInt8
+from jaxtyping import Int64
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from splatseg._check import check_shape
@@ -33,7 +30,9 @@ from splatseg.core.instance_tree import InstanceTree
 from splatseg.core.models import Inpainting
 from splatseg.core.rigid import quaternion_from_rotation
 from splatseg.core.sh import SH_C0
+from splatseg.edit.inpainting import ExemplarInpainter
 from splatseg.edit.planes import (
+    BELOW,
     FREE_VIEWS,
     KERNEL,
     MARGIN,
@@ -42,20 +41,14 @@ from splatseg.edit.planes import (
     Mask,
     Removal,
     Sheet,
-    dot,
     find_planes,
-    pixels_of,
     rim_cameras,
     rim_points,
     sheet_of,
     small_camera,
 )
 from splatseg.errors import InputError
-from splatseg.models import find_model, model_names
 from splatseg.render import back_project
-
-OPENCV = "opencv"
-"""Name of the inpainter that needs no weights."""
 
 _MOST_VIEWS = 96
 """Views that may look through a plane."""
@@ -68,48 +61,14 @@ _MIN_CELLS, _ROUNDS = 12, 4
 """Least cells of a hole, and rounds in which pixels that were given to refused holes go to what
 is behind."""
 
+_DIRECTIONS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))
+_MIN_DIRECTIONS = 4
+"""Steps, and the least number of directions in which a hidden cell must have seen surface first:
+beside a wall a floor is in five of eight."""
+
 _OPACITY, _SPREAD, _FLATNESS = 0.9, 0.6, 0.1
 """Opacity of a new Gaussian, and its standard deviations along and across the plane in cells:
 together they let less than a hundredth through and blur by less than a pixel."""
-
-_RADIUS = 5.0
-"""Pixels around a pixel that Telea's method asks."""
-
-
-@dataclass(frozen=True, slots=True)
-class OpenCvInpainter:
-    """OpenCV's inpainting by Telea's fast marching method: no weights, smooth."""
-
-    name: str = OPENCV
-    note: str = "smooth: patterns fade in large holes"
-
-    @property
-    def settings(self) -> Mapping[str, Any]:
-        """Its radius."""
-        return {"radius": _RADIUS}
-
-    def inpaint(
-        self, image: UInt8[Tensor, "height width 3"], mask: Bool[Tensor, "height width"]
-    ) -> UInt8[Tensor, "height width 3"]:
-        """The image, painted where the mask is True."""
-        holes = mask.numpy().astype(np.uint8)
-        painted = cv2.inpaint(image.numpy(), holes, _RADIUS, cv2.INPAINT_TELEA)
-        return torch.from_numpy(painted)
-
-
-@boundary
-def find_inpainter(name: str) -> Inpainting:
-    """The inpainter of this name: ``opencv``, or a model of another package (`find_model`).
-
-    Raises:
-        InputError: If there is none, or it does not inpaint.
-    """
-    if name == OPENCV:
-        return OpenCvInpainter()
-    model = find_model(name) if name in model_names() else None
-    if not isinstance(model, Inpainting):
-        raise InputError(f"fill: expected {OPENCV} or a model that inpaints, got {name!r}.")
-    return model
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -119,11 +78,16 @@ class Filled:
     gaussians: Gaussians
     """One a cell; may be none."""
 
+    replaced: Selection
+    """Of the scene with the thing: those that stay and lie where no view saw the surface, so that
+    their colours are arbitrary. They are to be removed as well."""
+
     holes: Int64[Tensor, "n"]
     """The hole that each is in."""
 
     rims: tuple[Int64[Tensor, "m"], ...]
-    """For each hole, rows of those Gaussians that stay which lie around it on the same plane."""
+    """For each hole, the Gaussians around it on the same plane: rows of the scene without the thing
+    and what is replaced."""
 
 
 @boundary
@@ -145,12 +109,12 @@ def fill(
         gaussians: The scene with the thing.
         removed: The thing.
         views: Views that saw the scene; only their cameras are used.
-        inpainter: Paints the images of planes; None is OpenCV's.
+        inpainter: Paints the images of planes; None is `ExemplarInpainter`.
         backend: Rendering backend.
         progress: Called with the views done and all there are to do.
 
     Returns:
-        New Gaussians, none where nothing is hidden; rows of `Filled.rims` count those that stay.
+        New Gaussians, none where nothing is hidden.
 
     Raises:
         InputError: If there are no views, or the inpainter gives no image of the same size.
@@ -174,14 +138,27 @@ def fill(
         if progress is not None:
             progress(done, len(cameras))
     _choose(sheets, looks)
-    painter = inpainter or OpenCvInpainter()
-    parts, holes, rims = [gaussians[:0]], [torch.zeros(0, dtype=torch.int64)], []
+    means = scene.stays.means.double().cpu().numpy()
+    arbitrary = np.zeros(len(means), np.bool_)
     for sheet in sheets:
-        for part, rim_rows in _holes_filled(sheet, scene, painter):
+        arbitrary |= sheet.holds(means, sheet.hole & sheet.hidden)
+    painter = inpainter or ExemplarInpainter()
+    parts, holes, rims = [gaussians[:0]], [torch.zeros(0, dtype=torch.int64)], []
+    number = np.cumsum(~arbitrary) - 1
+    for sheet in sheets:
+        for part, around in _holes_filled(sheet, scene, painter):
             holes.append(torch.full((len(part),), len(rims)))
             parts.append(part)
-            rims.append(rim_rows)
-    return Filled(gaussians=Gaussians.concatenate(parts), holes=torch.cat(holes), rims=tuple(rims))
+            rim = sheet.holds(means, around) & ~arbitrary
+            rims.append(torch.from_numpy(number[rim]))
+    replaced = torch.zeros(len(gaussians), dtype=torch.bool)
+    replaced[~removed.mask.cpu()] = torch.from_numpy(arbitrary)
+    return Filled(
+        gaussians=Gaussians.concatenate(parts),
+        replaced=Selection(mask=replaced),
+        holes=torch.cat(holes),
+        rims=tuple(rims),
+    )
 
 
 @boundary
@@ -286,7 +263,12 @@ def _typical(layer: Layer, rim: Tensor) -> int:
 
 
 def _none(gaussians: Gaussians) -> Filled:
-    return Filled(gaussians=gaussians[:0], holes=torch.zeros(0, dtype=torch.int64), rims=())
+    return Filled(
+        gaussians=gaussians[:0],
+        replaced=Selection(mask=torch.zeros(len(gaussians), dtype=torch.bool)),
+        holes=torch.zeros(0, dtype=torch.int64),
+        rims=(),
+    )
 
 
 # What is filled, and with what.
@@ -305,10 +287,12 @@ def _choose(sheets: Sequence[Sheet], looks: Sequence[Look]) -> None:
             joined = cv2.morphologyEx(won.astype(np.uint8), cv2.MORPH_CLOSE, KERNEL)
             hole = joined.astype(np.bool_) & sheet.possible
             sheet.hole = np.zeros_like(hole)
+            good = _enclosed(sheet)
             for part in _components(hole & ~no):
-                if _is_surrounded(sheet, part):
-                    sheet.hole |= part
-                else:
+                if good[part].mean() > 0.5 and int(sheet.known.sum()) >= int(part.sum()):
+                    sheet.hole |= part & good
+                    part = part & ~good
+                if part.any():
                     no |= part
                     again = True
         if not again:
@@ -326,9 +310,13 @@ def _claim(
         row, column, depth = sheet.hits(look)
         cells.append((row, column))
         may = look.thing & (row >= 0)
-        may &= look.heights(sheet.plane, look.before) > -sheet.thickness
-        may &= look.heights(sheet.plane, look.after) < -sheet.thickness
-        may &= (sheet.possible & ~refused[number])[row, column]
+        may &= look.heights(sheet.plane, look.before) > -BELOW * sheet.thickness
+        after = look.heights(sheet.plane, look.after)
+        # Where no view saw the surface, what is there now is not it.
+        here = np.where(
+            sheet.hidden[row, column], after < sheet.thickness, after < -BELOW * sheet.thickness
+        )
+        may &= here & (sheet.possible & ~refused[number])[row, column]
         nearer = may & (depth < best)
         best[nearer], which[nearer] = depth[nearer], number
     for number, (row, column) in enumerate(cells):
@@ -344,42 +332,49 @@ def _components(mask: Mask) -> Iterator[Mask]:
             yield part
 
 
-def _is_surrounded(sheet: Sheet, part: Mask) -> bool:
-    """Whether most cells of a hole have seen surface as the nearest that is not hidden.
+def _enclosed(sheet: Sheet) -> Mask:
+    """Cells that have seen surface around them, and not empty space, as beyond the edge of a table.
 
-    And not empty space, as beyond the edge of a table. No surface goes on further than it was seen.
+    What is not hidden is looked for in eight directions.
     """
-    known = sheet.known
-    observed = known | (sheet.free >= FREE_VIEWS)
-    if int(known.sum()) < int(part.sum()):
-        return False
-    nearest = cast(
-        "NDArray[np.int64]",
-        distance_transform_edt(~observed, return_distances=False, return_indices=True),
-    )
-    rows, columns = nearest
-    return bool(known[rows[part], columns[part]].mean() > 0.5)
+    known, free = sheet.known, sheet.free >= FREE_VIEWS
+    around = np.zeros(known.shape, np.int32)
+    through = np.zeros(known.shape, np.int32)
+    for down, right in _DIRECTIONS:
+        around += _first_met(known, free, down, right)
+        through += _first_met(free & ~known, known, down, right)
+    return (around >= _MIN_DIRECTIONS) & (around > through)
+
+
+def _first_met(wanted: Mask, other: Mask, down: int, right: int) -> Mask:
+    """Whether a walk from each cell against a direction meets a wanted one before another one."""
+    if not down:
+        return _first_met(wanted.T, other.T, right, 0).T
+    found = wanted.copy()
+    rows = range(1, len(found)) if down > 0 else range(len(found) - 2, -1, -1)
+    for row in rows:
+        before = found[row - down]
+        if right:
+            before = np.roll(before, right)
+            before[0 if right > 0 else -1] = False
+        found[row] = wanted[row] | (before & ~other[row])
+    return found
 
 
 def _holes_filled(
     sheet: Sheet, scene: Removal, inpainter: Inpainting
-) -> Iterator[tuple[Gaussians, Tensor]]:
-    """New Gaussians for each hole of a sheet, and the rows around it."""
+) -> Iterator[tuple[Gaussians, Mask]]:
+    """New Gaussians for each hole of a sheet, and the cells in it and around it."""
     if not sheet.hole.any():
         return
     image = torch.from_numpy((sheet.image * 255).round().astype(np.uint8))
     painted = inpainter.inpaint(image, torch.from_numpy(~sheet.known))
     check_shape("inpainted image", painted, tuple(image.shape))
     colours = painted.double() / 255
-    stays = scene.stays
-    means = stays.means.double().cpu().numpy()
-    row, column, inside = pixels_of(sheet.camera, means)
-    inside &= np.abs(dot(means, sheet.plane.normal) - sheet.plane.offset) < sheet.thickness
+    kernel = np.ones((MARGIN + 1, MARGIN + 1), np.uint8)
     for part in _components(sheet.hole):
-        kernel = np.ones((MARGIN + 1, MARGIN + 1), np.uint8)
         around = cv2.dilate(part.astype(np.uint8), kernel).astype(np.bool_)
-        rim = torch.from_numpy(np.flatnonzero(inside & around[row, column]))
-        yield _new_gaussians(sheet, part, colours, stays), rim
+        yield _new_gaussians(sheet, part, colours, scene.stays), around
 
 
 def _new_gaussians(sheet: Sheet, part: Mask, colours: Tensor, like: Gaussians) -> Gaussians:

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splatseg.core import Camera, Gaussians, Selection, View
-from splatseg.core.sh import evaluate_sh
 from splatseg.neighbours import NeighbourIndex
 from splatseg.render import Rendered, render
 from splatseg.render.warp import undistorted_camera
@@ -41,6 +40,11 @@ THICKNESS = 4.0
 """Distance from a plane, in pixels of the views, at which a point is still on it: fits of 512 x
 384 photographs scatter centres by about one."""
 
+BELOW = 3.0
+"""Distance behind a plane, in thicknesses, at which a view looks through it. Nothing is behind an
+opaque surface, so that what is a little behind it is an error of depth; what is before it may be
+another thing."""
+
 _FAR = 20.0
 """Distance of the camera above a plane, in its longest sides: nearly parallel projection."""
 
@@ -50,8 +54,8 @@ MARGIN = 16
 _MOST_CELLS = 384
 """Longest side of a plane's image."""
 
-_SEEN, _CLEAR = 0.5, 0.05
-"""Weight of the thing above which a pixel is its, and below which its colour is not."""
+_SEEN = 0.5
+"""Weight of the thing above which a pixel is its."""
 
 FREE_VIEWS = 2
 """Views that must look through a cell before it counts as empty: depths err along outlines."""
@@ -80,10 +84,7 @@ class Look:
 
     after: Array
     image: Array
-    """Colours before the removal, (h, w, 3) in [0, 1]."""
-
-    clear: Mask
-    """Pixels that nearly nothing of the thing colours, (h, w)."""
+    """Colours after the removal, (h, w, 3) in [0, 1]."""
 
     def points(self, depth: Array) -> Array:
         """Points at z-depths (h, w) or (n,) with rays alike."""
@@ -114,11 +115,8 @@ class Removal:
         return self.gaussians[~self.removed.mask]
 
     def before(self, camera: Camera) -> Rendered:
-        """The thing's share of each pixel, and the three colours."""
-        means = self.gaussians.means
-        rays = torch.nn.functional.normalize(means - camera.centre.to(means), dim=1)
-        colours = evaluate_sh(self.gaussians.sh, rays)
-        signal = torch.cat((self.removed.mask.to(means)[:, None], colours), dim=1)
+        """The thing's share of each pixel."""
+        signal = self.removed.mask.to(self.gaussians.means)[:, None]
         with torch.no_grad():
             return render(self.gaussians, camera, signal, backend=self.backend)
 
@@ -137,15 +135,14 @@ class Removal:
             thing=(drawn.image[..., 0] > _SEEN).cpu().numpy(),
             before=_surface(drawn.median_depth),
             after=_surface(left.median_depth),
-            image=_colours(drawn),
-            clear=(drawn.image[..., 0] < _CLEAR).cpu().numpy(),
+            image=_colours(left),
         )
 
 
 def _colours(drawn: Rendered) -> Array:
     """Colours without the black behind what is not quite opaque."""
     alpha = drawn.alpha.clamp_min(_SEEN)[..., None]
-    return (drawn.image[..., 1:] / alpha).clamp(0, 1).cpu().double().numpy()
+    return (drawn.image / alpha).clamp(0, 1).cpu().double().numpy()
 
 
 def _surface(depth: Tensor) -> Array:
@@ -245,7 +242,7 @@ def find_planes(points: Array, thickness: float) -> list[Plane]:
         else:
             found.append(Plane(normal, offset, rest[inside]))
         # What lies a little further off is of the same surface and makes no plane of its own.
-        rest = rest[np.abs(dot(rest, normal) - offset) >= 2 * thickness]
+        rest = rest[np.abs(dot(rest, normal) - offset) >= BELOW * thickness]
     return found
 
 
@@ -277,6 +274,9 @@ class Sheet:
     seen: NDArray[np.int32]
     """Views in which the surface is there."""
 
+    shown: NDArray[np.int32]
+    """Views that show something there or a little before it, which is not the thing."""
+
     hole: Mask
     """What is to be filled."""
 
@@ -284,8 +284,10 @@ class Sheet:
         """Count a view: where it looks through the plane, where it shows it, and how."""
         row, column, inside = pixels_of(look.camera, self.centres)
         height = look.heights(self.plane, look.before)[row, column]
-        self.free += inside & (height < -self.thickness)
-        seen = inside & (np.abs(height) <= self.thickness) & look.clear[row, column]
+        self.free += inside & (height < -BELOW * self.thickness)
+        near = inside & (np.abs(height) <= BELOW * self.thickness) & ~look.thing[row, column]
+        self.shown += near
+        seen = near & (height <= self.thickness)
         self.seen += seen
         # Straight and near views show most: pixels of a cell go as cosine over squared distance.
         ray = self.centres - look.centre
@@ -307,7 +309,7 @@ class Sheet:
     @property
     def hidden(self) -> Mask:
         """Cells that no view saw or looked through."""
-        found = (self.free < FREE_VIEWS) & (self.seen < FREE_VIEWS)
+        found = (self.free < FREE_VIEWS) & (self.shown < FREE_VIEWS)
         # Depths of faint texture err here and there.
         return cv2.morphologyEx(found.astype(np.uint8), cv2.MORPH_OPEN, KERNEL).astype(np.bool_)
 
@@ -315,6 +317,12 @@ class Sheet:
     def possible(self) -> Mask:
         """Cells where the surface is, or may be."""
         return self.hidden | self.known
+
+    def holds(self, points: Array, cells: Mask) -> Mask:
+        """Which points (n, 3) lie on the surface in some of the cells."""
+        row, column, inside = pixels_of(self.camera, points)
+        height = dot(points, self.plane.normal) - self.plane.offset
+        return inside & (np.abs(height) < self.thickness) & cells[row, column]
 
     def hits(self, look: Look) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
         """Row and column of the cell, and z-depth, where pixels (h, w) meet it; -1 beside it."""
@@ -354,8 +362,8 @@ def sheet_of(plane: Plane, looks: Sequence[Look], pixel: float) -> Sheet | None:
         own = dot(look.centre, plane.normal) - plane.offset
         with np.errstate(divide="ignore", invalid="ignore"):
             depth = -own / slope
-        open_to = look.heights(plane, look.after) < -thickness
-        behind = look.heights(plane, look.before) > -thickness
+        open_to = look.heights(plane, look.after) < thickness
+        behind = look.heights(plane, look.before) > -BELOW * thickness
         good = look.thing & open_to & behind & np.isfinite(depth) & (depth > 0)
         hidden.append(look.centre + look.rays[good] * depth[good][:, None])
     points = np.concatenate(hidden)
@@ -384,6 +392,7 @@ def sheet_of(plane: Plane, looks: Sequence[Look], pixel: float) -> Sheet | None:
         weights=np.zeros((rows, columns)),
         free=np.zeros((rows, columns), np.int32),
         seen=np.zeros((rows, columns), np.int32),
+        shown=np.zeros((rows, columns), np.int32),
         hole=np.zeros((rows, columns), np.bool_),
     )
 

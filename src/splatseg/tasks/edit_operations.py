@@ -137,8 +137,8 @@ class EditOptions:
 
     fill: str | None = None
     """With `remove`: continue floors, walls and other planes to where only what is removed stood
-    before them, painted by this inpainter: opencv, or a model of another package. None leaves
-    holes."""
+    before them, painted by this inpainter: exemplar, copies of what is around, so that patterns
+    go on; opencv, smooth; or a model of another package. None leaves holes."""
 
     pictures: Natural = 3
     """Number of views drawn before and after, those that change most, for reports/edit.html of the
