@@ -251,7 +251,7 @@ def test_scenes_are_joined(room, tmp_path) -> None:
         (["--move", "1", "0", "0", "--refit", "9"], "--fill: go with --remove only"),
         (
             ["--remove", "--layer", "objects", "--ids", "3", "--fill", "classical"],
-            "fill: expected opencv or a model that inpaints, got 'classical'",
+            "fill: expected exemplar, opencv or a model that inpaints, got 'classical'",
         ),
         (
             ["--remove", "--layer", "objects", "--ids", "3", "--cut", "off", "--refit", "9"],

@@ -407,7 +407,10 @@ def special(world: World, by_type: dict[type, Any]) -> dict[str, Any]:
         "synthetic.start_points.truths": {"a": world.truth, "b": world.truth},
         "synthetic.write_capture.folder": world.folder / "capture",
         "edit.filled_layer.filled": edit.Filled(
-            gaussians=world.gaussians[:0], holes=torch.zeros(0, dtype=torch.int64), rims=()
+            gaussians=world.gaussians[:0],
+            replaced=Selection(mask=torch.zeros(len(world.gaussians), dtype=torch.bool)),
+            holes=torch.zeros(0, dtype=torch.int64),
+            rims=(),
         ),
         "edit.filled_layer.layer": world.labels,
         "edit.layer_called.address": "things",
