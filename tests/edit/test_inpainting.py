@@ -12,6 +12,7 @@ from splatseg.edit.inpainting import (
     OpenCvInpainter,
     _copied,
     _Copies,
+    _light,
     _montage,
     _pairs,
     repeating_offsets,
@@ -148,6 +149,24 @@ def test_offsets_are_of_what_is_around_the_hole() -> None:
     mask[30:60, 50:80] = True
     offsets, _ = repeating_offsets(image / 255, mask)
     assert (offsets[0] % 10 == 0).all()
+
+
+def test_light_goes_on_as_it_is_beside_the_hole(monkeypatch) -> None:
+    """Half of a check is in the sun, and the hole is in the shade."""
+    image = check(90, 160)
+    image[:, 80:] //= 2
+    mask = np.zeros((90, 160), bool)
+    mask[30:60, 88:128] = True
+    monkeypatch.setattr(module, "_WORST", 1e9)
+    monkeypatch.setattr(module, "_MOST_OFFSETS", 500)
+    offsets, _ = repeating_offsets(image / 255, mask)
+    assert (offsets[:, 1] < -40).any(), "some copy from the sun"
+    assert error(painted(ExemplarInpainter(), image, mask), image, mask) < 60
+    light = _light(image / 255, mask)
+    assert light[45, 10] == pytest.approx((image[:, :60] / 255).mean(axis=(0, 1)), abs=0.02)
+    assert light[45, 108] == pytest.approx((image[:, 90:] / 255).mean(axis=(0, 1)), abs=0.03)
+    monkeypatch.setattr(module, "_LIGHT", -0.3)
+    assert error(painted(ExemplarInpainter(), image, mask), image, mask) > 600
 
 
 # The montage.

@@ -10,11 +10,13 @@ with k = 1 where the image I is known and weights w that fall with the distance 
 offsets by a few Fourier transforms. Every missing pixel then takes one of the best as its label l
 and shows :math:`I(x + s_l)`; labels are chosen for the least visible seams,
 
-.. math:: E(l) = \sum_x \lambda \sqrt{D(s_{l(x)})} + \sum_{(x, y)}
+.. math:: E(l) = \sum_x \lambda \sqrt{D(s_{l(x)})} + \mu |L(x) - L(x + s_{l(x)})| + \sum_{(x, y)}
           |I(x + s_{l(x)}) - I(x + s_{l(y)})| + |I(y + s_{l(x)}) - I(y + s_{l(y)})|,
 
-where a known neighbour counts as a label of its own, by expansion moves, each an exact minimum cut.
-What no offset reaches from the border is painted in a further pass, from what was painted before.
+where L is the mean colour of what is known around a pixel, so that a patch of sun is not copied
+into the shade, and a known neighbour counts as a label of its own. The least is looked for by
+expansion moves, each an exact minimum cut. What no offset reaches from the border is painted in a
+further pass, from what was painted before.
 
 References:
     He and Sun, Statistics of Patch Offsets for Image Completion, ECCV 2012: few dominant offsets,
@@ -35,7 +37,7 @@ import torch
 from jaxtyping import Bool, UInt8
 from numpy.typing import NDArray
 from scipy.fft import irfft2, next_fast_len, rfft2
-from scipy.ndimage import minimum_filter
+from scipy.ndimage import gaussian_filter, minimum_filter
 from torch import Tensor
 
 from splatseg.core.boundary import boundary
@@ -73,6 +75,10 @@ of what is around large holes, where there are any."""
 
 _PREFERENCE = 0.1
 """Weight of an offset's deviation at each pixel, the lambda of the energy."""
+
+_LIGHT = 0.3
+"""Weight of the difference between the mean colour around a pixel and around what is copied to it,
+sum over three colours: light and shade go on as they are beside the hole."""
 
 _UNKNOWN = 0.3
 """Cost of a seam next to which one of the two copies is unknown, sum over three colours."""
@@ -252,7 +258,10 @@ def _copied(painted: NDArray[np.uint8], missing: Mask) -> Mask:
     reached = copies.known.any(axis=0)
     row, column = row[reached], column[reached]
     copies = _Copies(copies.colours[:, reached], copies.known[:, reached])
-    unary = np.where(copies.known, _PREFERENCE * deviations[:, None], _IMPOSSIBLE)
+    light = _light(image, missing)
+    lit = _copies(light, missing, offsets, row, column).colours - light[row, column]
+    unary = _PREFERENCE * deviations[:, None] + _LIGHT * np.abs(lit).sum(axis=-1)
+    unary = np.where(copies.known, unary, _IMPOSSIBLE)
     for down, right in ((0, 1), (0, -1), (1, 0), (-1, 0)):
         unary += _border(image, missing, offsets, row + down, column + right)
     labels = _montage(unary, copies, *_pairs(row, column, missing.shape))
@@ -261,6 +270,16 @@ def _copied(painted: NDArray[np.uint8], missing: Mask) -> Mask:
     rest = missing.copy()
     rest[row, column] = False
     return rest
+
+
+def _light(image: Array, missing: Mask) -> Array:
+    """Mean colour of what is known around each pixel, (h, w, 3), also far inside a hole."""
+    known = (~missing).astype(np.float64)
+    weights = gaussian_filter(known, _NEAREST, truncate=8)
+    found = np.stack(
+        [gaussian_filter(image[..., i] * known, _NEAREST, truncate=8) for i in range(3)], axis=-1
+    )
+    return found / np.maximum(weights, 1e-30)[..., None]
 
 
 def _border(image: Array, missing: Mask, offsets: Index, row: Index, column: Index) -> Array:
