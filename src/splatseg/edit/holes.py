@@ -146,7 +146,7 @@ def fill(
     parts, holes, rims = [gaussians[:0]], [torch.zeros(0, dtype=torch.int64)], []
     number = np.cumsum(~arbitrary) - 1
     for sheet in sheets:
-        for part, around in _holes_filled(sheet, scene, painter):
+        for part, around in _holes_filled(sheet, gaussians, painter):
             holes.append(torch.full((len(part),), len(rims)))
             parts.append(part)
             rim = sheet.holds(means, around) & ~arbitrary
@@ -277,17 +277,17 @@ def _none(gaussians: Gaussians) -> Filled:
 def _choose(sheets: Sequence[Sheet], looks: Sequence[Look]) -> None:
     """Mark the cells to fill: what each pixel of the thing should show now, nearest first."""
     refused = [np.zeros_like(sheet.hole) for sheet in sheets]
+    enclosed = [_enclosed(sheet) for sheet in sheets]
     for _ in range(_ROUNDS):
         wins = [np.zeros_like(sheet.hole) for sheet in sheets]
         for look in looks:
             _claim(sheets, look, wins, refused)
         again = False
-        for sheet, won, no in zip(sheets, wins, refused, strict=True):
+        for sheet, won, no, good in zip(sheets, wins, refused, enclosed, strict=True):
             # Views sample far cells sparsely.
             joined = cv2.morphologyEx(won.astype(np.uint8), cv2.MORPH_CLOSE, KERNEL)
             hole = joined.astype(np.bool_) & sheet.possible
             sheet.hole = np.zeros_like(hole)
-            good = _enclosed(sheet)
             for part in _components(hole & ~no):
                 if good[part].mean() > 0.5 and int(sheet.known.sum()) >= int(part.sum()):
                     sheet.hole |= part & good
@@ -362,7 +362,7 @@ def _first_met(wanted: Mask, other: Mask, down: int, right: int) -> Mask:
 
 
 def _holes_filled(
-    sheet: Sheet, scene: Removal, inpainter: Inpainting
+    sheet: Sheet, like: Gaussians, inpainter: Inpainting
 ) -> Iterator[tuple[Gaussians, Mask]]:
     """New Gaussians for each hole of a sheet, and the cells in it and around it."""
     if not sheet.hole.any():
@@ -374,7 +374,7 @@ def _holes_filled(
     kernel = np.ones((MARGIN + 1, MARGIN + 1), np.uint8)
     for part in _components(sheet.hole):
         around = cv2.dilate(part.astype(np.uint8), kernel).astype(np.bool_)
-        yield _new_gaussians(sheet, part, colours, scene.stays), around
+        yield _new_gaussians(sheet, part, colours, like), around
 
 
 def _new_gaussians(sheet: Sheet, part: Mask, colours: Tensor, like: Gaussians) -> Gaussians:

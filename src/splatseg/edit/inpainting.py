@@ -318,16 +318,13 @@ def _montage(unary: Array, copies: _Copies, first: Index, second: Index) -> Inde
             cost += np.where(copies.known[one, ends] & copies.known[other, ends], apart, _UNKNOWN)
         return np.where(one == other, 0.0, cost)
 
-    def energy(labels: Index) -> float:
-        return float(unary[labels, pixels].sum() + seam(labels[first], labels[second]).sum())
-
     labels = unary.argmin(axis=0)
-    best = energy(labels)
+    both = seam(labels[first], labels[second])
+    best = float(unary[labels, pixels].sum() + both.sum())
     for _ in range(_CYCLES):
         before = best
         for label in range(len(unary)):
             new = np.full(len(first), label)
-            both = seam(labels[first], labels[second])
             # With x = 1 for the new label a pair (a, b) costs both + (to_second - both) x_a
             # - to_second x_b + 2 weight (1 - x_a) x_b, where the last product is
             # (|x_a - x_b| + x_b - x_a) / 2.
@@ -337,9 +334,10 @@ def _montage(unary: Array, copies: _Copies, first: Index, second: Index) -> Inde
             gain -= np.bincount(first, to_second - both - weight, len(pixels))
             gain -= np.bincount(second, weight - to_second, len(pixels))
             taken = np.where(minimum_cut(gain, first, second, weight), label, labels)
-            value = energy(taken)
+            after = seam(taken[first], taken[second])
+            value = float(unary[taken, pixels].sum() + after.sum())
             if value < best:
-                labels, best = taken, value
+                labels, both, best = taken, after, value
         if best == before:
             break
     return labels
