@@ -85,6 +85,21 @@ def test_edges_are_as_strong_as_the_formula_says() -> None:
     np.testing.assert_allclose(graph, expected, rtol=1e-5)
 
 
+def test_features_that_differ_little_count_as_much_as_those_that_differ(rng) -> None:
+    """Distances are in units of their median, which is far below 1 between like things."""
+    positions = rng.normal(size=(40, 3))
+
+    def strengths(spread: float) -> np.ndarray:
+        angles = np.linspace(0, spread, 40)
+        features = np.stack((np.cos(angles), np.sin(angles)), axis=1).astype(np.float32)
+        nodes = NodeAttributes(positions=positions, features=features)
+        return neighbour_graph(nodes, neighbours=5, colour_width=1, feature_width=0.5).toarray()
+
+    little, none = strengths(0.1), strengths(0.0)
+    np.testing.assert_allclose(little, strengths(0.05), atol=1e-4)
+    assert float(np.abs(little - none).max()) > 0.1 * float(none.max())
+
+
 def test_a_graph_keeps_its_edges_when_the_unit_of_length_changes(rng) -> None:
     positions = rng.normal(size=(60, 3))
 

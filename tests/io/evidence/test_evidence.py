@@ -265,6 +265,10 @@ def test_label_maps_round_trip(tmp_path, rng, highest) -> None:
     with Image.open(folder / "sub/a.jpg.png") as image:
         assert image.mode == ("L" if highest == 255 else "I;16")
     save_label_map(LabelMap(ids=ids), folder, "sub/a.jpg")
+    before = sorted(folder.rglob("*"))
+    save_label_map(LabelMap(ids=ids), folder, "other/b.jpg")
+    made = set(folder.rglob("*")) - set(before)
+    assert made == {folder / "other", folder / "other/b.jpg.png"}  # no folder of confidences
     assert open_evidence(folder).label_map("sub/a.jpg").confidence is None
 
 
@@ -372,6 +376,8 @@ def test_a_subset_of_masks_has_what_its_masks_have(rng) -> None:
     assert torch.equal(some.dense(0), dense[2])
     assert torch.equal(some.dense(1), dense[0])
     assert some.scores.tolist() == pytest.approx([0.3, 0.1])
+    assert repr(masks) == "MaskSet(3 masks of 5x4 pixels, 3 levels)"
+    assert repr(masks.subset([1])) == "MaskSet(1 masks of 5x4 pixels)"
     assert some.levels.tolist() == [0, 2]
     assert some.objectness is not None
     assert some.objectness.tolist() == [0.75, 0.5]

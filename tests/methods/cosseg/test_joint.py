@@ -10,7 +10,7 @@ from PIL import Image
 
 from splatseg.core import LabelMap
 from splatseg.errors import InputError
-from splatseg.methods._trained import linear_start
+from splatseg.methods._trained import linear_start, logit_loss, probability_loss
 from splatseg.methods.cosseg.decoder import FusionShape, decode_all
 from splatseg.methods.cosseg.features import distilled_features
 from splatseg.methods.cosseg.joint import LabelLoss, train_jointly
@@ -53,6 +53,17 @@ def label_loss(halves, evidence=None, **changes) -> LabelLoss:
         "rng": np.random.default_rng(2),
     } | changes  # fmt: skip
     return LabelLoss(points, weights, evidence or halves.evidence, **given)
+
+
+@pytest.mark.parametrize("classes", [2, 5])
+def test_a_loss_of_even_odds_is_one(classes: int) -> None:
+    label, sure = torch.tensor([0, 1]), torch.ones(2)
+    assert float(logit_loss(torch.zeros(2, classes), label, sure)) == pytest.approx(1)
+    alpha = torch.tensor([0.9, 0.3])
+    assert float(probability_loss(alpha / classes, alpha, sure, classes)) == pytest.approx(1)
+    half = torch.tensor([1.0, 0.0])  # confidence weighs, and does not normalise
+    assert float(probability_loss(alpha / classes, alpha, half, classes)) == pytest.approx(0.5)
+    assert float(probability_loss(alpha, alpha, sure, 1)) == 0
 
 
 def test_the_loss_by_hand(halves) -> None:

@@ -212,6 +212,9 @@ def test_what_is_no_surface_is_left_out(monkeypatch) -> None:
     # Ten times the median distance to the fourth nearest reaches the whole sheet.
     assert left_out(_SCALE_SHARE=36 / 37) == [0, 1, 2, 36]
     assert left_out(_SCALE_SHARE=1.0) == [0, 2, 36]
+    scales[3], scales[4] = torch.tensor([0.31, 0.01, 0.01]), torch.tensor([0.29, 0.01, 0.01])
+    assert left_out(_SCALE_SHARE=1.0) == [0, 2, 3, 36]
+    scales[3:5] = scales[5]
     assert left_out(_SCALE_SHARE=36 / 37, _MAX_ELONGATION=1e9) == [1, 2, 36]
     assert left_out(_SCALE_SHARE=36 / 37, _MIN_OPACITY=0.0) == [0, 1, 36]
     assert left_out(_SCALE_SHARE=36 / 37, _NEAREST_FACTOR=1e3) == [0, 1, 2]

@@ -201,6 +201,9 @@ def test_bad_tables(rng) -> None:
     values = rows_of(rng, count=5)
     with pytest.raises(RangeError, match="float16, got 1e\\+06"):
         store(values * 0 + 1e6, precision="float16")
+    with pytest.raises(RangeError, match="at most 65504 for float16"):
+        store(values * 0 + 65600, precision="float16")
+    assert bool((store(values * 0 + 65504, precision="float16").decode() == 65504).all())
     with pytest.raises(RangeError, match="parts: expected at least 1"):
         store(values, precision="product", parts=0)
     with pytest.raises(RangeError):
