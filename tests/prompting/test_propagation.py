@@ -11,7 +11,13 @@ from splatseg.errors import InputError
 from splatseg.lift import label_map
 from splatseg.prompting.pipeline import SceneIndex
 from splatseg.prompting.prompts import ViewPrompt
-from splatseg.prompting.propagation import MAX_VIEWS, PropagatedMasks
+from splatseg.prompting.propagation import (
+    MAX_VIEWS,
+    PropagatedMasks,
+    _Candidate,
+    _chosen,
+    _meanings,
+)
 from splatseg.prompting.seen import ViewCache, see_prompts
 from splatseg.tasks import SelectionSession, SelectOptions
 from support.wall import camera, field_ids
@@ -129,6 +135,70 @@ def test_the_best_supported_meaning_is_the_object(
         gaussians, source.membership(_click(gaussians, views), granularity=granularity)
     )
     assert {field for field, share in shares.items() if share > 0.5} == set(fields)
+
+
+@pytest.mark.parametrize(
+    ("says", "whole"),
+    [
+        (((PIECE,), (PIECE,), (FIELD,)), True),
+        (((PIECE, FIELD), (PIECE,), (PIECE,)), False),  # the model told of both, and chose
+        (((PIECE, FIELD),) * 3, True),
+        (((PIECE,), (PIECE,), (OTHER,)), False),
+    ],
+)
+def test_an_object_is_the_whole_of_what_is_found_more_often(
+    gaussians, views, source_of, says, whole
+) -> None:
+    """The left piece has a little more than half of the field."""
+    source = source_of(Painter(lambda view: says[view]))
+    chosen = source._meant(_click(gaussians, views), None, [])
+    share = chosen.shares()[(field_ids(gaussians) == 1) & (gaussians.means[:, 0].abs() < 1.4)]
+    assert bool(float((share > 0.5).float().mean()) > 0.9) == whole
+
+
+def _masks(views: Sequence[View], first: int, end: int, *, score: float = 1.0) -> list[_Candidate]:
+    """A mask of Gaussians first to end in each view, of 600 that all of them show whole."""
+    inside = torch.zeros(600)
+    inside[first:end] = 1
+    return [
+        _Candidate(view=view, inside=inside, total=torch.ones(600), score=score) for view in views
+    ]
+
+
+@pytest.mark.parametrize(
+    ("whole", "seen", "size"),
+    [
+        ((0, 125), 4, 100),  # the same thing with a thicker rim
+        ((0, 135), 4, 135),
+        ((0, 395), 4, 395),
+        ((0, 405), 4, 100),  # a group
+        ((25, 300), 4, 100),  # another thing that it overlaps
+        ((15, 300), 4, 285),
+        ((0, 200), 2, 200),
+        ((0, 200), 1, 100),  # one in ten found it
+    ],
+)
+def test_what_may_be_the_whole_of_a_part(views, whole, seen, size) -> None:
+    part = _masks(views[:6], 0, 100)
+    found = _chosen([part, _masks(views[6 : 6 + seen], *whole)], None, 10)
+    assert float(found[0].inside.sum()) == size
+
+
+@pytest.mark.parametrize(("score", "size"), [(0.8, 10), (0.7, 500)])
+def test_of_what_was_found_once_the_small_has_an_advantage(views, score, size) -> None:
+    """0.8 / 6 - 0.02 lg 10 = 0.113 and 1 / 6 - 0.02 lg 500 = 0.113."""
+    small, large = _masks(views[:1], 0, 10, score=score), _masks(views[1:2], 0, 500)
+    assert float(_chosen([large, small], None, 6)[0].inside.sum()) == size
+
+
+@pytest.mark.parametrize(("share", "joined"), [(0.62, False), (0.66, True)])
+def test_masks_that_are_alike_mean_the_same(views, share, joined) -> None:
+    """0.7 - 1 / sqrt(area): 0.644 for an area of 324."""
+    pair = _masks(views[:1], 0, 500) + _masks(views[1:2], 0, round(500 * share))
+    assert len(_meanings(pair)) == (1 if joined else 2)
+    small = _masks(views[:1], 0, 50) + _masks(views[1:2], 0, round(50 * share))
+    assert len(_meanings(small)) == 1  # rims of small ones are much of them
+    assert len(_meanings(_masks(views[:1], 0, 9) + _masks(views[1:2], 9, 18))) == 2
 
 
 def test_a_part_is_the_smallest_supported_meaning(gaussians, views, source_of) -> None:

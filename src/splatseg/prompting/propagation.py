@@ -9,8 +9,9 @@ view and others in the next. With the inside and visible mass of each mask a on 
 .. math:: s(a, b) = \frac{\sum_i c_i \min(q_{ai}, q_{bi})}{\sum_i c_i \max(q_{ai}, q_{bi})},
           \qquad q_a = m_a / t_a, \quad c = \min(t_a, t_b),
 
-and those that are alike become one meaning, at most one mask of each view. The best supported one
-is the object.
+and those that are alike become one meaning, at most one mask of each view. An object is found in
+most views, its parts in some, and the groups that it stands in in few: the best supported meaning
+is the object, unless it is a part of a larger one that has some support, alone, in another view.
 
 **What it covers.** Of the masks :math:`m_v` of a meaning in the views V, each Gaussian is a member
 with the share of its light that is inside,
@@ -60,8 +61,20 @@ _MIN_KNOWN = 0.5
 _MIN_SEED = 0.3
 """Share of a pixel's light from Gaussians of the click, with which it shows them."""
 
-_SAME = 0.6
-"""Likeness from which on two masks mean the same."""
+_SAME, _RIM = 0.7, 1.0
+"""Likeness from which on two masks mean the same, and what their rims, which are a pixel wide, may
+take of it: so many pixels by the root of the smaller one's area."""
+
+_WHOLE, _PART_OF = 0.3, 0.8
+"""Share of the best support that the whole of a part needs, and of the part that is inside."""
+
+_LEAST_GROWTH, _MOST_GROWTH = 1.3, 4.0
+"""Sizes of the whole, in sizes of the part that was clicked: less is the same thing, more a group
+or a room."""
+
+_PREFER_SMALL = 0.02
+"""Support for which a meaning may be ten times as large: masks of whole walls are found once each,
+and must not win because nothing else was found twice."""
 
 _MIN_AGREEMENT = 0.5
 """Least IoU of the model's mask with what is known of the thing, over the pixels that are known."""
@@ -208,7 +221,7 @@ class PropagatedMasks:
             if one.view not in asked:
                 asked.append(one.view)
                 here = [other for other in prompts if other.view is one.view]
-                found += self._candidates(one.view, _prompt_of(here), seed)
+                found += self._candidates(one.view, _prompt_of(here))
         left = [view for view in self._views if view not in asked]
         known = self._empty()
         known.add(asked[0], seed, torch.ones_like(seed))
@@ -222,7 +235,7 @@ class PropagatedMasks:
             if pixel is not None:
                 asked.append(view)
                 known.views.append(view)
-                found += self._candidates(view, Prompt(points=torch.tensor([pixel])), seed)
+                found += self._candidates(view, Prompt(points=torch.tensor([pixel])))
         if not found:
             raise InputError(
                 f"prompter: expected a mask at the prompts in view {asked[0].name}, "
@@ -240,21 +253,17 @@ class PropagatedMasks:
         self._note(f"{len(told)} of {len(asked)} views show what is meant")
         return known
 
-    def _candidates(self, view: View, prompt: Prompt, seed: Tensor) -> list[_Candidate]:
-        """The model's masks on the Gaussians, scored by how much of what was clicked is inside."""
+    def _candidates(self, view: View, prompt: Prompt) -> list[_Candidate]:
+        """The model's masks on the Gaussians."""
         found = self._model.prompted_masks(self._model.embed(self._image_of(view)), prompt)
         scores: list[float] = found.scores.tolist()
         if not scores:
             return []
         every, total = self._cache.mask_masses(view, found)
-        shown = (seed * total).sum().clamp_min(1e-9)
         return [
-            _Candidate(
-                view=view, inside=inside, total=total,
-                score=score * float((seed * inside).sum() / shown),
-            )
+            _Candidate(view=view, inside=inside, total=total, score=score)
             for inside, score in zip(every, scores, strict=True)
-        ]  # fmt: skip
+        ]
 
     def _count(self, known: _Known, view: View, mask: Bool[Tensor, "height width"]) -> None:
         """Add what a mask says."""
@@ -396,12 +405,20 @@ def _prompt_of(prompts: Sequence[VisiblePrompt]) -> Prompt:
     return Prompt(points=pixels.float() + 0.5, positive=signs, box=box)
 
 
-def _likeness(a: _Candidate, b: _Candidate) -> float:
-    """s(a, b): the IoU of two masks over what both views saw."""
+def _overlap(a: _Candidate, b: _Candidate) -> tuple[float, float, float]:
+    """Of two masks, over what both views saw: what both hold, either holds, and the first holds."""
     common = torch.minimum(a.total, b.total)
     first, second = a.inside / a.total.clamp_min(1e-9), b.inside / b.total.clamp_min(1e-9)
     both = float((common * torch.minimum(first, second)).sum())
-    return both / max(float((common * torch.maximum(first, second)).sum()), 1e-9)
+    either = float((common * torch.maximum(first, second)).sum())
+    return both, max(either, 1e-9), max(float((common * first).sum()), 1e-9)
+
+
+def _likeness(a: _Candidate, b: _Candidate) -> float:
+    """s(a, b), and what their rims may take of it; 0 without an overlap."""
+    both, either, _ = _overlap(a, b)
+    area = min(float(a.inside.sum()), float(b.inside.sum()))
+    return both / either + _RIM / max(area, _MIN_PIXELS) ** 0.5 if both else 0.0
 
 
 def _meanings(found: Sequence[_Candidate]) -> list[list[_Candidate]]:
@@ -430,15 +447,42 @@ def _meanings(found: Sequence[_Candidate]) -> list[list[_Candidate]]:
 def _chosen(
     meanings: list[list[_Candidate]], granularity: float | None, views: int
 ) -> list[_Candidate]:
-    """The best supported meaning; for groups the largest and for parts the smallest of support."""
-    worth = [sum(one.score for one in group) / views for group in meanings]
-    best = max(range(len(worth)), key=worth.__getitem__)
-    if granularity is None or _COARSE < granularity < _FINE:
-        return meanings[best]
+    """The meaning that is the object; of groups the largest, of parts the smallest supported."""
+    support = [sum(one.score for one in group) / views for group in meanings]
     sizes = [float(np.mean([float(one.inside.sum()) for one in group])) for group in meanings]
-    supported = [i for i, value in enumerate(worth) if value >= _SUPPORTED * worth[best]]
+    preference = [
+        share - _PREFER_SMALL * float(np.log10(max(size, 1.0)))
+        for share, size in zip(support, sizes, strict=True)
+    ]
+    best = max(range(len(meanings)), key=preference.__getitem__)
+    if granularity is None or _COARSE < granularity < _FINE:
+        wholes = [
+            i
+            for i in range(len(meanings))
+            if support[i] >= _WHOLE * support[best]
+            and _LEAST_GROWTH * sizes[best] <= sizes[i] <= _MOST_GROWTH * sizes[best]
+            and (support[i] >= support[best] or _found_alone(meanings[i], meanings[best]))
+            and _share_inside(meanings[best], meanings[i]) >= _PART_OF
+        ]
+        return meanings[max(wholes, key=preference.__getitem__, default=best)]
+    supported = [i for i, share in enumerate(support) if share >= _SUPPORTED * support[best]]
     choose = max if granularity <= _COARSE else min
     return meanings[choose(supported, key=sizes.__getitem__)]
+
+
+def _found_alone(whole: Sequence[_Candidate], part: Sequence[_Candidate]) -> bool:
+    """Whether a view shows the one without the other.
+
+    Models that find both in every view say by their scores which is the object.
+    """
+    views = [one.view for one in part]
+    return any(one.view not in views for one in whole)
+
+
+def _share_inside(part: Sequence[_Candidate], whole: Sequence[_Candidate]) -> float:
+    """Share of one meaning that is inside another, mean over masks of different views."""
+    overlaps = [_overlap(a, b) for a in part for b in whole if a.view is not b.view]
+    return float(np.mean([both / own for both, _, own in overlaps])) if overlaps else 0.0
 
 
 def _towards(view: View, centre: Tensor) -> Float[Tensor, "3"]:
