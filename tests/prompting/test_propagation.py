@@ -9,15 +9,10 @@ from splatseg.core import Gaussians, Labels, MaskSet, Scene, View
 from splatseg.core.models import Embedding
 from splatseg.errors import InputError
 from splatseg.lift import label_map
+from splatseg.prompting.meanings import Candidate, chosen_meaning, meanings_of
 from splatseg.prompting.pipeline import SceneIndex
 from splatseg.prompting.prompts import ViewPrompt
-from splatseg.prompting.propagation import (
-    MAX_VIEWS,
-    PropagatedMasks,
-    _Candidate,
-    _chosen,
-    _meanings,
-)
+from splatseg.prompting.propagation import MAX_VIEWS, PropagatedMasks
 from splatseg.prompting.seen import ViewCache, see_prompts
 from splatseg.tasks import SelectionSession, SelectOptions
 from support.wall import camera, field_ids
@@ -156,12 +151,12 @@ def test_an_object_is_the_whole_of_what_is_found_more_often(
     assert bool(float((share > 0.5).float().mean()) > 0.9) == whole
 
 
-def _masks(views: Sequence[View], first: int, end: int, *, score: float = 1.0) -> list[_Candidate]:
+def _masks(views: Sequence[View], first: int, end: int, *, score: float = 1.0) -> list[Candidate]:
     """A mask of Gaussians first to end in each view, of 600 that all of them show whole."""
     inside = torch.zeros(600)
     inside[first:end] = 1
     return [
-        _Candidate(view=view, inside=inside, total=torch.ones(600), score=score) for view in views
+        Candidate(view=view, inside=inside, total=torch.ones(600), score=score) for view in views
     ]
 
 
@@ -180,7 +175,7 @@ def _masks(views: Sequence[View], first: int, end: int, *, score: float = 1.0) -
 )
 def test_what_may_be_the_whole_of_a_part(views, whole, seen, size) -> None:
     part = _masks(views[:6], 0, 100)
-    found = _chosen([part, _masks(views[6 : 6 + seen], *whole)], None, 10)
+    found = chosen_meaning([part, _masks(views[6 : 6 + seen], *whole)], None, 10)
     assert float(found[0].inside.sum()) == size
 
 
@@ -188,17 +183,17 @@ def test_what_may_be_the_whole_of_a_part(views, whole, seen, size) -> None:
 def test_of_what_was_found_once_the_small_has_an_advantage(views, score, size) -> None:
     """0.8 / 6 - 0.02 lg 10 = 0.113 and 1 / 6 - 0.02 lg 500 = 0.113."""
     small, large = _masks(views[:1], 0, 10, score=score), _masks(views[1:2], 0, 500)
-    assert float(_chosen([large, small], None, 6)[0].inside.sum()) == size
+    assert float(chosen_meaning([large, small], None, 6)[0].inside.sum()) == size
 
 
 @pytest.mark.parametrize(("share", "joined"), [(0.62, False), (0.66, True)])
 def test_masks_that_are_alike_mean_the_same(views, share, joined) -> None:
     """0.7 - 1 / sqrt(area): 0.644 for an area of 324."""
     pair = _masks(views[:1], 0, 500) + _masks(views[1:2], 0, round(500 * share))
-    assert len(_meanings(pair)) == (1 if joined else 2)
+    assert len(meanings_of(pair)) == (1 if joined else 2)
     small = _masks(views[:1], 0, 50) + _masks(views[1:2], 0, round(50 * share))
-    assert len(_meanings(small)) == 1  # rims of small ones are much of them
-    assert len(_meanings(_masks(views[:1], 0, 9) + _masks(views[1:2], 9, 18))) == 2
+    assert len(meanings_of(small)) == 1  # rims of small ones are much of them
+    assert len(meanings_of(_masks(views[:1], 0, 9) + _masks(views[1:2], 9, 18))) == 2
 
 
 def test_a_part_is_the_smallest_supported_meaning(gaussians, views, source_of) -> None:

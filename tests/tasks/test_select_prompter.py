@@ -11,10 +11,10 @@ from splatseg.core import InstanceTree, Labels, MaskSet, TreeNode
 from splatseg.core.models import Embedding
 from splatseg.errors import InputError
 from splatseg.io.scene import load_scene, load_scene_layer, save_scene_layer
+from splatseg.prompting.meanings import segmented_prompts
 from splatseg.prompting.prompts import AxisBox, ViewPrompt
 from splatseg.tasks import SelectOptions, select
 from splatseg.tasks.see import prompter_of
-from splatseg.tasks.select import segmented_prompts
 
 
 class Squares:

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from splatseg._check import check_finite
-from splatseg.core import Gaussians, Selection, View
+from splatseg.core import JSON, Gaussians, Selection, View
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.models import signs_of_points
 from splatseg.errors import InputError, RangeError, ShapeError
@@ -243,6 +243,40 @@ Solid: TypeAlias = AxisBox | Ball | Balls | Lasso
 
 SelectionPrompt: TypeAlias = ViewPrompt | AxisBox | Ball | Balls | Lasso | Similar
 """All that can be selected by."""
+
+
+def prompt_record(prompt: SelectionPrompt) -> dict[str, JSON]:
+    """What a prompt says, in values that JSON holds; of masks and strokes, how many pixels."""
+    match prompt:
+        case AxisBox():
+            return {"kind": "box", "low": list(prompt.low), "high": list(prompt.high)}
+        case Ball():
+            return {"kind": "sphere", "centre": list(prompt.centre), "radius": prompt.radius}
+        case Balls():
+            middles: list[JSON] = [[float(v) for v in one] for one in prompt.centres.tolist()]
+            return {"kind": "spheres", "centres": middles, "radius": prompt.radius}
+        case Lasso():
+            corners: list[JSON] = [[float(v) for v in corner] for corner in prompt.polygon.tolist()]
+            return {"kind": "lasso", "view": prompt.view.name, "polygon": corners}
+        case Similar():
+            return {"kind": "similar", "gaussians": prompt.selection.count}
+        case _:
+            pass
+    record: dict[str, JSON] = {"kind": "view", "view": prompt.view.name}
+    for name, wanted in (("points", True), ("negative_points", False)):
+        chosen = prompt.points[prompt.signs == wanted].tolist()
+        if chosen:
+            record[name] = [[float(x), float(y)] for x, y in chosen]
+    if prompt.box is not None:
+        record["box"] = [float(v) for v in prompt.box.tolist()]
+    for name in ("mask", "scribble", "negative_scribble"):
+        pixels = getattr(prompt, name)
+        if pixels is not None:
+            record[f"{name}_pixels"] = int(pixels.sum())
+    return record
+
+
+# A session of selecting: what is kept from one selection to the next, and how one is made.
 
 
 def pixels_in_box(box: Float[Tensor, "4"], height: int, width: int) -> Bool[Tensor, "height width"]:

@@ -1,17 +1,8 @@
 r"""A click carried from view to view: what it means without masks of all views beforehand.
 
 **What is meant.** The Gaussians of the clicked pixel are found in a few more views that show them,
-each from another side, and a promptable model is asked at their brightest pixel there. One point
-means several things, a part, an object, what stands on it, and the model finds some of them in one
-view and others in the next. With the inside and visible mass of each mask a on the Gaussians,
-:math:`m_a = W_v^T a` and :math:`t_a = W_v^T 1`, two masks are alike by what both views saw,
-
-.. math:: s(a, b) = \frac{\sum_i c_i \min(q_{ai}, q_{bi})}{\sum_i c_i \max(q_{ai}, q_{bi})},
-          \qquad q_a = m_a / t_a, \quad c = \min(t_a, t_b),
-
-and those that are alike become one meaning, at most one mask of each view. An object is found in
-most views, its parts in some, and the groups that it stands in in few: the best supported meaning
-is the object, unless it is a part of a larger one that has some support, alone, in another view.
+each from another side, and a promptable model is asked at their brightest pixel there. Masks of
+different views that are alike become one meaning, and one of them is the object (`meanings`).
 
 **What it covers.** Of the masks :math:`m_v` of a meaning in the views V, each Gaussian is a member
 with the share of its light that is inside,
@@ -42,6 +33,7 @@ from splatseg.core import MaskSet, PromptableMasks, View
 from splatseg.core.models import Image, Prompt
 from splatseg.errors import InputError
 from splatseg.prompting.graph import graph_cut
+from splatseg.prompting.meanings import Candidate, chosen_meaning, meanings_of
 from splatseg.prompting.next_click import in_image, largest_region
 from splatseg.prompting.pipeline import POINTED_AT, SceneIndex
 from splatseg.prompting.seen import ViewCache, VisiblePrompt
@@ -61,21 +53,6 @@ _MIN_KNOWN = 0.5
 _MIN_SEED = 0.3
 """Share of a pixel's light from Gaussians of the click, with which it shows them."""
 
-_SAME, _RIM = 0.7, 1.0
-"""Likeness from which on two masks mean the same, and what their rims, which are a pixel wide, may
-take of it: so many pixels by the root of the smaller one's area."""
-
-_WHOLE, _PART_OF = 0.3, 0.8
-"""Share of the best support that the whole of a part needs, and of the part that is inside."""
-
-_LEAST_GROWTH, _MOST_GROWTH = 1.3, 4.0
-"""Sizes of the whole, in sizes of the part that was clicked: less is the same thing, more a group
-or a room."""
-
-_PREFER_SMALL = 0.02
-"""Support for which a meaning may be ten times as large: masks of whole walls are found once each,
-and must not win because nothing else was found twice."""
-
 _MIN_AGREEMENT = 0.5
 """Least IoU of the model's mask with what is known of the thing, over the pixels that are known."""
 
@@ -92,12 +69,6 @@ _FAR_WORTH = 0.25
 _STABLE = 0.02
 """Share of the members that a view changes at most where they stay the same."""
 
-_COARSE, _FINE = 0.25, 0.75
-"""Granularities up to which the largest meaning is taken, and from which on the smallest."""
-
-_SUPPORTED = 0.5
-"""Share of the best support that a larger or smaller meaning needs."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LookedAt:
@@ -109,16 +80,6 @@ class LookedAt:
 
     accepted: bool
     """Whether a mask of it counted."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Candidate:
-    """A mask of a view on the Gaussians."""
-
-    view: View
-    inside: Float[Tensor, "n"]
-    total: Float[Tensor, "n"]
-    score: float
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -214,7 +175,7 @@ class PropagatedMasks:
         looked_at: list[LookedAt],
     ) -> _Known:
         """What points or boxes mean, by the model's masks in several views."""
-        found: list[_Candidate] = []
+        found: list[Candidate] = []
         asked: list[View] = []
         seed = self._seed(prompts)
         for one in prompts:
@@ -242,7 +203,7 @@ class PropagatedMasks:
                 f"{self._model.name} found none there, nor at the same place in "
                 f"{len(asked) - 1} other views."
             )
-        chosen = _chosen(_meanings(found), granularity, len(asked))
+        chosen = chosen_meaning(meanings_of(found), granularity, len(asked))
         known = self._empty()
         for one in chosen:
             known.add(one.view, one.inside, one.total)
@@ -253,7 +214,7 @@ class PropagatedMasks:
         self._note(f"{len(told)} of {len(asked)} views show what is meant")
         return known
 
-    def _candidates(self, view: View, prompt: Prompt) -> list[_Candidate]:
+    def _candidates(self, view: View, prompt: Prompt) -> list[Candidate]:
         """The model's masks on the Gaussians."""
         found = self._model.prompted_masks(self._model.embed(self._image_of(view)), prompt)
         scores: list[float] = found.scores.tolist()
@@ -261,7 +222,7 @@ class PropagatedMasks:
             return []
         every, total = self._cache.mask_masses(view, found)
         return [
-            _Candidate(view=view, inside=inside, total=total, score=score)
+            Candidate(view=view, inside=inside, total=total, score=score)
             for inside, score in zip(every, scores, strict=True)
         ]
 
@@ -403,86 +364,6 @@ def _prompt_of(prompts: Sequence[VisiblePrompt]) -> Prompt:
             corners = (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1)
             box = torch.tensor([float(corner) for corner in corners])
     return Prompt(points=pixels.float() + 0.5, positive=signs, box=box)
-
-
-def _overlap(a: _Candidate, b: _Candidate) -> tuple[float, float, float]:
-    """Of two masks, over what both views saw: what both hold, either holds, and the first holds."""
-    common = torch.minimum(a.total, b.total)
-    first, second = a.inside / a.total.clamp_min(1e-9), b.inside / b.total.clamp_min(1e-9)
-    both = float((common * torch.minimum(first, second)).sum())
-    either = float((common * torch.maximum(first, second)).sum())
-    return both, max(either, 1e-9), max(float((common * first).sum()), 1e-9)
-
-
-def _likeness(a: _Candidate, b: _Candidate) -> float:
-    """s(a, b), and what their rims may take of it; 0 without an overlap."""
-    both, either, _ = _overlap(a, b)
-    area = min(float(a.inside.sum()), float(b.inside.sum()))
-    return both / either + _RIM / max(area, _MIN_PIXELS) ** 0.5 if both else 0.0
-
-
-def _meanings(found: Sequence[_Candidate]) -> list[list[_Candidate]]:
-    """Masks that mean the same, joined pair by pair, the most alike first (average linkage)."""
-    groups = [[i] for i in range(len(found))]
-    likeness = np.zeros((len(found), len(found)))
-    for i, a in enumerate(found):
-        for j in range(i):
-            if found[j].view is not a.view:
-                likeness[i, j] = likeness[j, i] = _likeness(a, found[j])
-    while True:
-        best, pair = _SAME, None
-        for i, first in enumerate(groups):
-            for j in range(i):
-                views = {id(found[k].view) for k in first}
-                if views & {id(found[k].view) for k in groups[j]}:
-                    continue
-                mean = float(likeness[np.ix_(first, groups[j])].mean())
-                if mean > best:
-                    best, pair = mean, (j, i)
-        if pair is None:
-            return [[found[k] for k in group] for group in groups]
-        groups[pair[0]] += groups.pop(pair[1])
-
-
-def _chosen(
-    meanings: list[list[_Candidate]], granularity: float | None, views: int
-) -> list[_Candidate]:
-    """The meaning that is the object; of groups the largest, of parts the smallest supported."""
-    support = [sum(one.score for one in group) / views for group in meanings]
-    sizes = [float(np.mean([float(one.inside.sum()) for one in group])) for group in meanings]
-    preference = [
-        share - _PREFER_SMALL * float(np.log10(max(size, 1.0)))
-        for share, size in zip(support, sizes, strict=True)
-    ]
-    best = max(range(len(meanings)), key=preference.__getitem__)
-    if granularity is None or _COARSE < granularity < _FINE:
-        wholes = [
-            i
-            for i in range(len(meanings))
-            if support[i] >= _WHOLE * support[best]
-            and _LEAST_GROWTH * sizes[best] <= sizes[i] <= _MOST_GROWTH * sizes[best]
-            and (support[i] >= support[best] or _found_alone(meanings[i], meanings[best]))
-            and _share_inside(meanings[best], meanings[i]) >= _PART_OF
-        ]
-        return meanings[max(wholes, key=preference.__getitem__, default=best)]
-    supported = [i for i, share in enumerate(support) if share >= _SUPPORTED * support[best]]
-    choose = max if granularity <= _COARSE else min
-    return meanings[choose(supported, key=sizes.__getitem__)]
-
-
-def _found_alone(whole: Sequence[_Candidate], part: Sequence[_Candidate]) -> bool:
-    """Whether a view shows the one without the other.
-
-    Models that find both in every view say by their scores which is the object.
-    """
-    views = [one.view for one in part]
-    return any(one.view not in views for one in whole)
-
-
-def _share_inside(part: Sequence[_Candidate], whole: Sequence[_Candidate]) -> float:
-    """Share of one meaning that is inside another, mean over masks of different views."""
-    overlaps = [_overlap(a, b) for a in part for b in whole if a.view is not b.view]
-    return float(np.mean([both / own for both, _, own in overlaps])) if overlaps else 0.0
 
 
 def _towards(view: View, centre: Tensor) -> Float[Tensor, "3"]:

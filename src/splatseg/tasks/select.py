@@ -13,14 +13,13 @@ from splatseg.core import (
     JSON,
     Layer,
     LayerInfo,
-    MaskSet,
     PromptableMasks,
     Scene,
     Selection,
 )
 from splatseg.core.boundary import boundary
-from splatseg.core.models import Image, Prompt
 from splatseg.errors import InputError, ShapeError
+from splatseg.prompting.meanings import segmented_prompts
 from splatseg.prompting.next_click import NextClick
 from splatseg.prompting.pipeline import (
     MembershipSource,
@@ -33,14 +32,12 @@ from splatseg.prompting.pipeline import (
     postprocess,
 )
 from splatseg.prompting.prompts import (
-    AxisBox,
-    Ball,
-    Balls,
     Lasso,
     SelectionPrompt,
     Similar,
     Solid,
     ViewPrompt,
+    prompt_record,
 )
 from splatseg.prompting.propagation import PropagatedMasks
 from splatseg.prompting.seen import ViewCache, VisiblePrompt, see_prompts
@@ -54,9 +51,6 @@ from splatseg.tasks.sources import (
     open_source,
 )
 from splatseg.tasks.work import SILENT, Observer, Work, layer_versions
-
-_COARSE, _FINE = 0.25, 0.75
-"""Granularities up to which the largest mask is meant, and from which on the smallest."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -492,94 +486,3 @@ def within(
 
 
 # Prompts become a selection.
-
-
-def segmented_prompts(
-    prompts: Sequence[SelectionPrompt], model: PromptableMasks, *, granularity: float | None
-) -> tuple[SelectionPrompt, ...]:
-    """Prompts of which those by points and boxes became masks.
-
-    The model sees the photograph of the view with all points and the box of a prompt. Its mask
-    stands for the positive points and the box; negative points stay. Of several masks the best is
-    taken, at the granularity of groups the largest, at that of parts the smallest. Prompts with a
-    mask, or with strokes, are left as they are, and so are those without a positive point or a box.
-
-    Raises:
-        InputError: If a view has no photograph, or the model finds nothing at a prompt.
-    """
-    return tuple(
-        _segmented(prompt, model, granularity) if isinstance(prompt, ViewPrompt) else prompt
-        for prompt in prompts
-    )
-
-
-def _segmented(prompt: ViewPrompt, model: PromptableMasks, granularity: float | None) -> ViewPrompt:
-    drawn = (prompt.mask, prompt.scribble, prompt.negative_scribble)
-    if any(pixels is not None for pixels in drawn):
-        return prompt
-    if prompt.box is None and not bool(prompt.signs.any()):
-        return prompt
-    view = prompt.view
-    if view.image is None:
-        raise InputError(
-            f"prompter: expected a view with a photograph, which {model.name} sees, got "
-            f"{view.name} without one."
-        )
-    image: Image = view.read_image()
-    asked = Prompt(points=prompt.points, positive=prompt.signs, box=prompt.box)
-    found = model.prompted_masks(model.embed(image), asked)
-    if not len(found):
-        raise InputError(
-            f"prompter: expected a mask at the prompts in view {view.name}, {model.name} found "
-            "none."
-        )
-    mask = _meant(found, granularity)
-    negative = ~prompt.signs
-    return ViewPrompt(
-        view=view, mask=mask, points=prompt.points[negative], positive=prompt.signs[negative]
-    )
-
-
-def _meant(found: MaskSet, granularity: float | None) -> torch.Tensor:
-    """The mask that a granularity means; the first is the best."""
-    areas = [mask.area for mask in found.masks]
-    index = 0
-    if granularity is not None and granularity <= _COARSE:
-        index = areas.index(max(areas))
-    elif granularity is not None and granularity >= _FINE:
-        index = areas.index(min(areas))
-    return found.dense(index)
-
-
-def prompt_record(prompt: SelectionPrompt) -> dict[str, JSON]:
-    """What a prompt says, in values that JSON holds; of masks and strokes, how many pixels."""
-    match prompt:
-        case AxisBox():
-            return {"kind": "box", "low": list(prompt.low), "high": list(prompt.high)}
-        case Ball():
-            return {"kind": "sphere", "centre": list(prompt.centre), "radius": prompt.radius}
-        case Balls():
-            middles: list[JSON] = [[float(v) for v in one] for one in prompt.centres.tolist()]
-            return {"kind": "spheres", "centres": middles, "radius": prompt.radius}
-        case Lasso():
-            corners: list[JSON] = [[float(v) for v in corner] for corner in prompt.polygon.tolist()]
-            return {"kind": "lasso", "view": prompt.view.name, "polygon": corners}
-        case Similar():
-            return {"kind": "similar", "gaussians": prompt.selection.count}
-        case _:
-            pass
-    record: dict[str, JSON] = {"kind": "view", "view": prompt.view.name}
-    for name, wanted in (("points", True), ("negative_points", False)):
-        chosen = prompt.points[prompt.signs == wanted].tolist()
-        if chosen:
-            record[name] = [[float(x), float(y)] for x, y in chosen]
-    if prompt.box is not None:
-        record["box"] = [float(v) for v in prompt.box.tolist()]
-    for name in ("mask", "scribble", "negative_scribble"):
-        pixels = getattr(prompt, name)
-        if pixels is not None:
-            record[f"{name}_pixels"] = int(pixels.sum())
-    return record
-
-
-# A session of selecting: what is kept from one selection to the next, and how one is made.

@@ -19,11 +19,11 @@ from splatseg.lift.referring import referring_readings
 from splatseg.lift.vocabulary import vocabulary_of
 from splatseg.methods.prompt import PromptOptions, PromptSession, PromptSources, selection_of
 from splatseg.prompting.pipeline import SceneIndex, SelectionContext, postprocess
-from splatseg.prompting.prompts import Solid, ViewPrompt
+from splatseg.prompting.prompts import Solid, ViewPrompt, prompt_record
 from splatseg.prompting.seen import ViewCache
 from splatseg.render import BackendName
 from splatseg.tasks.query import QueryResult, QuerySession, reference_record
-from splatseg.tasks.select import Selected, check_base, combined, prompt_record, within
+from splatseg.tasks.select import Selected, check_base, combined, within
 from splatseg.tasks.sources import STEPS, SelectOptions
 from splatseg.tasks.word_sources import QueryOptions, feature_evidence, mask_name
 from splatseg.tasks.work import SILENT, Observer, Work, layer_versions

@@ -31,11 +31,17 @@ from splatseg.core import (
 from splatseg.errors import InputError
 from splatseg.prompting.next_click import next_click
 from splatseg.prompting.pipeline import SceneIndex
-from splatseg.prompting.prompts import Lasso, SelectionPrompt, Solid, ViewPrompt
+from splatseg.prompting.prompts import (
+    Lasso,
+    SelectionPrompt,
+    Solid,
+    ViewPrompt,
+    prompt_record,
+)
 from splatseg.prompting.seen import ViewCache
 from splatseg.render import BackendName
 from splatseg.tasks.query import QuerySession
-from splatseg.tasks.select import SelectionSession, open_selector, prompt_record
+from splatseg.tasks.select import SelectionSession, open_selector
 from splatseg.tasks.sources import SelectOptions
 from splatseg.tasks.word_sources import QueryOptions
 from splatseg.tasks.work import Observer, Work
