@@ -12,13 +12,11 @@ from splatseg.io.foreign import expect, malformed, read_lines
 
 
 def number_table(lines: Sequence[bytes], columns: int) -> NDArray[np.float64]:
-    """Numbers of lines of text (rows, columns), separated by white space; NaN and infinity too.
+    """Numbers of one or more lines of text (rows, columns), NaN and infinity too.
 
     Raises:
         ValueError: If a word is no number, or a line has more or fewer of them.
     """
-    if not lines:
-        return np.empty((0, columns))
     table = np.loadtxt(lines, ndmin=2, comments=None)
     if table.shape != (len(lines), columns):
         raise ValueError(f"they have {table.shape[1]}")

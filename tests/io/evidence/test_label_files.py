@@ -293,6 +293,7 @@ def test_stacks_of_masks(
     masks = evidence.masks("a")
     assert [masks.dense(k).tolist() for k in (0, 1)] == (MASKS > 0).tolist()
     assert masks.scores.tolist() == scores
+    assert masks.levels.tolist() == [0, 0]
 
 
 def test_an_array_without_a_name_counts_where_it_is_alone(tmp_path: Path) -> None:
