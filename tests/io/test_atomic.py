@@ -1,6 +1,7 @@
 """Files and folders that appear whole, names from data, and failures of the system in words."""
 
 import errno
+import importlib
 import json
 import os
 import subprocess
@@ -66,6 +67,26 @@ def test_failed_file_leaves_the_old_one(tmp_path: Path, error: type[BaseExceptio
         write_half()
     assert (tmp_path / "a").read_bytes() == b"old"
     assert names(tmp_path) == ["a"]
+
+
+@pytest.mark.parametrize("place", ["shutil.rmtree", "splatseg.io.atomic.try_lock"])
+def test_ctrl_c_while_the_hidden_folder_is_made_or_removed_leaves_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str
+) -> None:
+    module, name = place.rsplit(".", 1)
+    original, calls = getattr(importlib.import_module(module), name), []
+
+    def interrupted(*args: object, **keywords: object) -> object:
+        calls.append(args)
+        if len(calls) == 1:
+            raise KeyboardInterrupt
+        return original(*args, **keywords)
+
+    monkeypatch.setattr(place, interrupted)
+    with pytest.raises(KeyboardInterrupt), atomic_file(tmp_path / "a.txt") as temporary:
+        temporary.write_text("new")
+    assert calls
+    assert not list(tmp_path.glob(".splatseg*"))
 
 
 def test_file_follows_a_link(tmp_path: Path) -> None:

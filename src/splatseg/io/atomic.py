@@ -241,12 +241,23 @@ def hidden_folder(target: Path) -> Generator[Path]:
     """
     with named_write_failures(target):
         holder = Path(tempfile.mkdtemp(prefix=f"{TEMPORARY}{os.getpid()}-", dir=target.parent))
-    handle = _locked(holder)
+    handle = None
     try:
+        handle = _locked(holder)
         yield holder
     finally:
+        _remove(holder)  # while it is locked, or another process may take it for abandoned
+        if handle is not None:
+            os.close(handle)
+
+
+def _remove(holder: Path) -> None:
+    """Remove a hidden folder, whole even if Ctrl-C comes meanwhile."""
+    try:
         shutil.rmtree(holder, ignore_errors=True)
-        os.close(handle)
+    except KeyboardInterrupt:
+        shutil.rmtree(holder, ignore_errors=True)
+        raise
 
 
 def sweep(folder: Path) -> None:
