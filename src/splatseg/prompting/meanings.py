@@ -135,10 +135,10 @@ def _overlap(a: Candidate, b: Candidate) -> tuple[float, float, float]:
 
 
 def _likeness(a: Candidate, b: Candidate) -> float:
-    """s(a, b), and what their rims may take of it; 0 without an overlap."""
+    """s(a, b), and what their rims may take of it, which is far from `_SAME` without an overlap."""
     both, either, _ = _overlap(a, b)
     area = min(float(a.inside.sum()), float(b.inside.sum()))
-    return both / either + _RIM / max(area, _LEAST_AREA) ** 0.5 if both else 0.0
+    return both / either + _RIM / max(area, _LEAST_AREA) ** 0.5
 
 
 def meanings_of(found: Sequence[Candidate]) -> list[list[Candidate]]:
