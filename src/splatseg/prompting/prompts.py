@@ -276,9 +276,6 @@ def prompt_record(prompt: SelectionPrompt) -> dict[str, JSON]:
     return record
 
 
-# A session of selecting: what is kept from one selection to the next, and how one is made.
-
-
 def pixels_in_box(box: Float[Tensor, "4"], height: int, width: int) -> Bool[Tensor, "height width"]:
     """Pixels of an image whose centre lies in a box x0, y0, x1, y1."""
     x0, y0, x1, y1 = box.double().tolist()

@@ -483,6 +483,3 @@ def within(
     for inside in places:
         confidence = torch.where(inside.to(confidence.device), confidence, 0.0)
     return confidence
-
-
-# Prompts become a selection.
