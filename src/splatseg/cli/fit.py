@@ -16,6 +16,7 @@ from splatseg.cli._shared import (
     print_result,
     typed,
 )
+from splatseg.errors import InputError
 from splatseg.fit import FitOptions, Preset, Strategy
 from splatseg.report.fit_report import scored_of
 from splatseg.tasks import ImportOptions, MadeScene, MakeSceneOptions, fit_capture, import_scene
@@ -37,6 +38,8 @@ class Command(Printing):
     splatseg fit capture -o room --preset quick --steps 3000 --seed 1
 
     splatseg fit walk.mp4 -o room --frames 200 --json
+
+    splatseg fit more-photographs --add room -o room2
     """
 
     data: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")]
@@ -123,6 +126,8 @@ def run(command: Command) -> None:
 
 
 def _options(command: Command) -> FitOptions:
+    if command.capture.add is not None and command.minutes is not None:
+        raise InputError("minutes: photographs are added in steps (`--steps`), got minutes.")
     options = FitOptions.preset(command.preset)
     scans = command.capture.scans
     options = replace(

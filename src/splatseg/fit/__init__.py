@@ -5,6 +5,7 @@ photographs and from any other differentiable loss.
 """
 
 from splatseg.core.checkpoints import Checkpoints as Checkpoints
+from splatseg.fit._adding import added_gaussians as added_gaussians
 from splatseg.fit._checkpoint import CheckpointSummary as CheckpointSummary
 from splatseg.fit._checkpoint import checkpoint_gaussians as checkpoint_gaussians
 from splatseg.fit._checkpoint import checkpoint_summary as checkpoint_summary

@@ -89,7 +89,7 @@ def with_start_points(
         photographs,
         count=count,
         generator=generator,
-        depth_range=_depth_range_of_points(own, photographs),
+        depth_range=depth_range_of_points(own, photographs),
         max_difference=_MAX_DIFFERENCE,
     )
     return replace(capture, points=_joined(own, more))
@@ -108,7 +108,7 @@ def random_point_count(capture: Capture, options: FitOptions) -> int:
     return max(0, min(COUNT, int(_MAX_GAUSSIANS_SHARE * options.max_gaussians)) - own)
 
 
-def _depth_range_of_points(points: PointCloud, photographs: TrainingPhotographs) -> DepthRange:
+def depth_range_of_points(points: PointCloud, photographs: TrainingPhotographs) -> DepthRange:
     """Depths of points in the views, with a margin; that of the cameras if there are few."""
     cameras = [photographs.camera(i) for i in range(len(photographs))]
     found: list[Tensor] = []
@@ -174,6 +174,7 @@ def random_points(
     generator: torch.Generator,
     depth_range: DepthRange | None = None,
     max_difference: float | None = None,
+    first: int | None = None,
 ) -> PointCloud:
     """Points on rays of random pixels, each at the depth of lowest photometric cost.
 
@@ -185,6 +186,8 @@ def random_points(
             depths.
         max_difference: Points with this photometric cost or more are left out, mean
             difference of colours in [0, 1]; None keeps all.
+        first: Photographs of which so many, the first ones, have their pixels sampled; the others
+            are compared with. None is all.
     """
     use_prior = depth_range is None
     if depth_range is None:
@@ -198,8 +201,9 @@ def random_points(
     order = _neighbour_views([example.camera for example in examples])
     points: list[Tensor] = []
     colours: list[Tensor] = []
-    for i, example in enumerate(examples):
-        ray_count = count * (i + 1) // len(examples) - count * i // len(examples)
+    sampled = sum(index < first for index in indices) if first is not None else len(examples)
+    for i, example in enumerate(examples[:sampled]):
+        ray_count = count * (i + 1) // sampled - count * i // sampled
         pixels = _sampled_pixels(example, ray_count, generator)
         if len(pixels) == 0:
             continue

@@ -170,6 +170,10 @@ class MatchedMaps:
     """Intersection over union, in [0, 1], that a segment must have with what the layer shows,
     the same that joins segments (`AssociateOptions.agreement`)."""
 
+    min_labelled: Share = 0.0
+    """Above 0, pixels at which the layer has no label are left out of a segment's overlap, as where
+    the scene has grown, and of a segment at least this share must be labelled."""
+
     longest_side: int = 1000
     """Segments of larger photographs are read at this many pixels along their longest side;
     bounds time."""
@@ -204,24 +208,29 @@ class MatchedMaps:
             background=self.labels.background,
         )
         drawn = label_map(self.gaussians, camera, hard, backend=self.backend).ids.long()
+        least = self.min_overlap, self.min_labelled
         if isinstance(segments, LabelMap):
-            return _of_map(segments, drawn, self.min_overlap)
-        return _of_masks(segments, drawn, self.min_overlap)
+            return _of_map(segments, drawn, least)
+        return _of_masks(segments, drawn, least)
 
 
-def _of_map(segments: LabelMap, drawn: Int64[Tensor, "height width"], least: float) -> LabelMap:
+Least = tuple[float, float]
+"""Overlap that a segment must have, and share of it that must be labelled (0 counts all of it)."""
+
+
+def _of_map(segments: LabelMap, drawn: Int64[Tensor, "height width"], least: Least) -> LabelMap:
     """Segments that do not overlap: one table of how often each meets each id."""
     names, place = torch.unique(segments.ids.cpu().long(), return_inverse=True)
     ids, column = torch.unique(drawn, return_inverse=True)
     table = torch.bincount(
         (place * len(ids) + column).reshape(-1), minlength=len(names) * len(ids)
     ).view(len(names), len(ids))
-    best, overlap = _best(table.double(), table.sum(1).double(), table.sum(0).double(), ids)
-    chosen = torch.where((overlap >= least) & (names != UNLABELLED), best, UNLABELLED)
+    best, overlap = _best(table.double(), table.sum(0).double(), ids, least[1])
+    chosen = torch.where((overlap >= least[0]) & (names != UNLABELLED), best, UNLABELLED)
     return LabelMap(ids=chosen[place].int())
 
 
-def _of_masks(masks: MaskSet, drawn: Int64[Tensor, "height width"], least: float) -> LabelMap:
+def _of_masks(masks: MaskSet, drawn: Int64[Tensor, "height width"], least: Least) -> LabelMap:
     """Masks that overlap: each pixel takes the id of the best of those over it."""
     # Down one column after another, as the runs of masks go.
     flat = drawn.T.reshape(-1)
@@ -233,8 +242,8 @@ def _of_masks(masks: MaskSet, drawn: Int64[Tensor, "height width"], least: float
     for mask in masks.masks:
         inside = np.repeat(np.arange(len(mask.counts)) % 2 == 1, mask.counts)
         meets = torch.from_numpy(np.bincount(column[inside], minlength=len(ids))).double()
-        best, overlap = _best(meets[None], meets.sum()[None], whole, ids)
-        if float(overlap) < least:
+        best, overlap = _best(meets[None], whole, ids, least[1])
+        if float(overlap) < least[0]:
             continue
         better = inside & (float(overlap) > strength)
         found[better], strength[better] = int(best), float(overlap)
@@ -243,16 +252,19 @@ def _of_masks(masks: MaskSet, drawn: Int64[Tensor, "height width"], least: float
 
 def _best(
     meets: Float[Tensor, "segments ids"],
-    areas: Float[Tensor, "segments"],
     whole: Float[Tensor, "ids"],
     ids: Int64[Tensor, "ids"],
+    min_labelled: float,
 ) -> tuple[Int64[Tensor, "segments"], Float[Tensor, "segments"]]:
     """For each segment the id that it overlaps most with (the smaller of equals), and how much.
 
     No label, -1, is no id.
     """
-    union = areas[:, None] + whole - meets
+    areas = meets.sum(dim=1)
+    labelled = meets[:, ids != UNLABELLED].sum(dim=1)
+    union = (labelled if min_labelled > 0 else areas)[:, None] + whole - meets
     overlap = torch.where(union > 0, meets / union.clamp_min(1), 0.0)
     overlap[:, ids == UNLABELLED] = 0.0
+    overlap[labelled < min_labelled * areas] = 0.0
     best = overlap.max(dim=1)
     return ids[best.indices], best.values

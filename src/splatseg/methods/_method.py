@@ -124,6 +124,10 @@ class Method:
     run: Callable[[MethodInputs, Any], Layer | Refined]
     """Makes the layer, from the inputs and an instance of `options`."""
 
+    update: Callable[[MethodInputs, Any, Any], Layer] | None = None
+    """Adds the evidence of further views, those of the inputs, to a layer that it made (the last
+    argument). None where a method starts again with all views."""
+
     returns: Returns = "labels"
 
     keeps_ids: bool = False

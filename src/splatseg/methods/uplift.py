@@ -3,8 +3,11 @@
 from collections.abc import Callable, Sequence
 from dataclasses import field, replace
 
+import torch
+
 from splatseg.core import ClassTable, Features, Gaussians, Labels, LabelSource, View
 from splatseg.core.options import options
+from splatseg.errors import InputError
 from splatseg.lift.voting.confusion import (
     CANDIDATES,
     DEFAULT_CONFUSION,
@@ -12,6 +15,7 @@ from splatseg.lift.voting.confusion import (
     correct_confusion,
 )
 from splatseg.lift.voting.features import FeatureUpliftOptions, uplift_features
+from splatseg.lift.voting.more_votes import with_votes
 from splatseg.lift.voting.uplift import UpliftOptions, uplift
 from splatseg.methods._method import Method, MethodInputs
 
@@ -95,6 +99,21 @@ def run(inputs: MethodInputs, options: UpliftMethodOptions) -> Labels:
     )
 
 
+def update(inputs: MethodInputs, options: UpliftMethodOptions, layer: Labels) -> Labels:
+    """Add the votes of further views, see `with_votes`; the ids known are not relabelled again."""
+    votes = uplift(
+        inputs.gaussians,
+        inputs.views,
+        inputs.evidence,
+        options=options.votes.with_candidates(CANDIDATES),
+        classes=inputs.label_names,
+        backend=inputs.backend,
+        progress=inputs.progress,
+    )
+    names = {**votes.info.names, **layer.info.names}
+    return with_votes(replace(layer, info=replace(layer.info, names=names)), votes)
+
+
 METHOD = Method(
     name="uplift",
     summary="every pixel votes for its id on the Gaussians it shows; one pass, memory bounded",
@@ -102,6 +121,7 @@ METHOD = Method(
     evidence=("labels", "tracked"),
     options=UpliftMethodOptions,
     run=run,
+    update=update,
     keeps_ids=True,
     published=UpliftMethodOptions(correct_confusion=False),
 )
@@ -119,6 +139,24 @@ def run_features(inputs: MethodInputs, options: FeatureUpliftOptions) -> Feature
     )
 
 
+def update_features(
+    inputs: MethodInputs, options: FeatureUpliftOptions, layer: Features
+) -> Features:
+    r"""Add the features of further views: weighted means, :math:`(w f + w' f') / (w + w')`."""
+    if layer.weights is None:
+        raise InputError("update: expected features with the weights they rest on, got none.")
+    more = run_features(inputs, options)
+    if more.values.shape[1] != layer.values.shape[1] or more.weights is None:
+        raise InputError(
+            f"update: expected {layer.values.shape[1]} channels as the layer has, got "
+            f"{more.values.shape[1]}."
+        )
+    weights = layer.weights + more.weights
+    sums = layer.values * layer.weights.unsqueeze(1) + more.values * more.weights.unsqueeze(1)
+    values = sums / torch.where(weights > 0, weights, 1.0).unsqueeze(1)
+    return replace(layer, values=values, weights=weights)
+
+
 FEATURES = Method(
     name="features",
     summary="each Gaussian takes the mean of the features that its pixels show",
@@ -126,5 +164,6 @@ FEATURES = Method(
     evidence=("features",),
     options=FeatureUpliftOptions,
     run=run_features,
+    update=update_features,
     returns="features",
 )

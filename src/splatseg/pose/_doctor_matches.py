@@ -97,7 +97,7 @@ def match_views(
     import cv2
 
     chosen = choose_views(len(views), max_views)
-    features = {i: _features(views[i], longest) for i in chosen}
+    features = {i: sift_features(views[i], longest) for i in chosen}
     matcher = cv2.BFMatcher(cv2.NORM_L2)
     rng = np.random.default_rng(0)
     kept: list[NDArray[np.float64]] = []
@@ -119,7 +119,9 @@ def match_views(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Features:
+class SiftFeatures:
+    """Features of one photograph."""
+
     pixels: NDArray[np.float64]
     """(n, 2) in the photograph's own pixels."""
 
@@ -130,7 +132,8 @@ class _Features:
     longest: float
 
 
-def _features(view: View, longest: int) -> _Features:
+def sift_features(view: View, longest: int) -> SiftFeatures:
+    """SIFT features of a view's photograph, found at a longest side of so many pixels."""
     import cv2
 
     image = load_image(view, longest=longest).numpy()
@@ -142,7 +145,7 @@ def _features(view: View, longest: int) -> _Features:
         [view.camera.width / grey.shape[1], view.camera.height / grey.shape[0]], dtype=np.float64
     )
     if not keypoints:
-        return _Features(
+        return SiftFeatures(
             pixels=np.zeros((0, 2)),
             descriptors=np.zeros((0, 128), np.float32),
             scale=float(scale[0]),
@@ -152,7 +155,7 @@ def _features(view: View, longest: int) -> _Features:
     pixels = (np.array([k.pt for k in keypoints], dtype=np.float64) + 0.5) * scale
     # Hellinger distance instead of Euclidean (RootSIFT): fewer wrong matches at no cost.
     root = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-9))
-    return _Features(
+    return SiftFeatures(
         pixels=pixels,
         descriptors=root.astype(np.float32),
         scale=float(scale[0]),
@@ -160,10 +163,14 @@ def _features(view: View, longest: int) -> _Features:
     )
 
 
-def _match(first: _Features, second: _Features, matcher: Any, cv2: Any) -> NDArray[Any] | None:
-    """(n, 2, 2) verified pixels of a pair; None where there are too few or they do not move."""
-    if min(len(first.pixels), len(second.pixels)) < _MIN_KEYPOINTS:
-        return None
+def mutual_matches(first: SiftFeatures, second: SiftFeatures, matcher: Any) -> NDArray[np.int64]:
+    """(n, 2) features that are each other's nearest, and much nearer than the next (Lowe 2004).
+
+    Args:
+        first: At least two features.
+        second: At least two features.
+        matcher: OpenCV's, of the Euclidean distance.
+    """
     forward = matcher.knnMatch(first.descriptors, second.descriptors, k=2)
     back = {m.queryIdx: m.trainIdx for m in matcher.match(second.descriptors, first.descriptors)}
     good = [
@@ -171,9 +178,18 @@ def _match(first: _Features, second: _Features, matcher: Any, cv2: Any) -> NDArr
         for best, other in forward
         if best.distance < _RATIO * other.distance and back.get(best.trainIdx) == best.queryIdx
     ]
-    if len(good) < _MIN_KEYPOINTS:
+    return np.array(good, dtype=np.int64).reshape(-1, 2)
+
+
+def _match(
+    first: SiftFeatures, second: SiftFeatures, matcher: Any, cv2: Any
+) -> NDArray[Any] | None:
+    """(n, 2, 2) verified pixels of a pair; None where there are too few or they do not move."""
+    if min(len(first.pixels), len(second.pixels)) < _MIN_KEYPOINTS:
         return None
-    index = np.array(good)
+    index = mutual_matches(first, second, matcher)
+    if len(index) < _MIN_KEYPOINTS:
+        return None
     pixels = np.stack([first.pixels[index[:, 0]], second.pixels[index[:, 1]]], axis=1)
     cv2.setRNGSeed(0)
     try:

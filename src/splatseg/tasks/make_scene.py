@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +34,7 @@ from splatseg.render import BackendName
 from splatseg.report.fit_report import FitReportData, FitVerdict, fit_record, fit_report, verdict_of
 from splatseg.report.images import Gallery, GalleryImage, colour_difference
 from splatseg.report.maps import camera_map
+from splatseg.tasks.add_photographs import add_photographs
 from splatseg.tasks.checkpoints import check_fit_output, fit_folder
 from splatseg.tasks.fit_objects import object_labels
 from splatseg.tasks.moving import (
@@ -124,6 +125,17 @@ def fit_capture(
     """
     options = options or MakeSceneOptions()
     fit_options = fit_options or FitOptions()
+    if options.add is not None:
+        return _with_more(
+            data,
+            options.add,
+            folder,
+            options=options,
+            fit_options=fit_options,
+            backend=backend,
+            command=command,
+            observer=observer,
+        )
     onwards = check_fit_output(folder, options)
     with fit_folder(folder):
         began = time.monotonic()
@@ -184,6 +196,69 @@ def fit_capture(
         poses=poses,
         moving=moving,
         verdict=verdict,
+        timings=told.timings,
+    )
+
+
+_WITH_ADD = ("add", "format", "strict")
+"""Options that say something of photographs that are added to a scene."""
+
+
+def _with_more(
+    data: Path | Capture,
+    base: Path,
+    folder: Path,
+    *,
+    options: MakeSceneOptions,
+    fit_options: FitOptions,
+    backend: BackendName,
+    command: str,
+    observer: Observer,
+) -> MadeScene:
+    """`fit_capture` of photographs that are added to a scene."""
+    fresh = MakeSceneOptions()
+    for field in fields(options):
+        name = field.name
+        if name not in _WITH_ADD and getattr(options, name) != getattr(fresh, name):
+            raise InputError(f"{name}: expected none with `add`, got {getattr(options, name)!r}.")
+    if isinstance(data, Capture):
+        raise InputError("data: expected a folder with `add`, got a capture that was read.")
+    added = add_photographs(
+        data,
+        base,
+        folder,
+        options=fit_options,
+        format=options.format,
+        strict=options.strict,
+        backend=backend,
+        observer=observer,
+    )
+    scene = added.scene
+    capture = Capture(
+        path=scene.source or folder, format="scene", views=scene.views, up=scene.up,
+        classes=scene.classes, metres_per_unit=scene.metres_per_unit,
+    )  # fmt: skip
+    told, report = score_and_report(
+        folder,
+        capture,
+        added.result,
+        options=fit_options,
+        backend=backend,
+        scoring=True,
+        command=command,
+        timings={"photographs added": added.result.seconds},
+    )
+    return MadeScene(
+        folder=folder,
+        capture=capture,
+        result=added.result,
+        interrupted=False,
+        scores=told.scores,
+        held_out=told.held_out,
+        report=report,
+        poses=None,
+        moving=None,
+        verdict=verdict_of(told),
         timings=told.timings,
     )
 

@@ -78,6 +78,11 @@ class MakeSceneOptions(CheckpointOptions):
     frames: Count = 120
     """Number of frames taken from a video."""
 
+    add: Path | None = None
+    """Scene folder that the photographs are added to: they are placed among its own, Gaussians are
+    added where it has none, and all are optimised for some steps more (steps, or 20 a view). The
+    result is a new scene, with the layers and the evidence of this one."""
+
     keep_checkpoint: bool = False
     """Keep the checkpoint of the finished fit, so that `resume` with more minutes or steps can make
     it longer."""

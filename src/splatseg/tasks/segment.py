@@ -34,10 +34,12 @@ from splatseg.tasks.segment_inputs import (
     check_fit,
     classes_to_merge,
     evidence_to_lift,
+    layer_to_update,
     named_companions,
     named_models,
     trained_features,
     unmasked,
+    views_to_add,
     views_to_lift,
     with_companions,
 )
@@ -87,6 +89,10 @@ class SegmentOptions:
     classes: str | None = None
     """With instances: name of a layer of classes to merge them with. Instances take their class
     from it, and stuff classes become one segment each: the layer is panoptic."""
+
+    update: bool = False
+    """Add the views that the layer of this name does not have yet, and keep what it knows: the cost
+    is that of these views alone. For uplift, features and associate, after `fit --add`."""
 
     seed: int = 0
     """Seed of all random choices."""
@@ -203,6 +209,9 @@ def segment_work(
     merged = classes_to_merge(work, evidence, options.classes)
     check_name("layer", layer_name := options.layer or name)
     views = views_to_lift(work, evidence, options.views)
+    before = layer_to_update(work, method, layer_name) if options.update else None
+    if before is not None:
+        views = views_to_add(views, before, layer_name)
     keeps_state = trained is None and folder is None
     inputs = MethodInputs(
         gaussians=scene.gaussians,
@@ -229,7 +238,11 @@ def segment_work(
     with with_resume_hint(inputs.checkpoints, work.observer):
         began = time.monotonic()
         with work.observer.stage("segment") as step:
-            layer = method.run(replace(inputs, progress=step), chosen)
+            inputs = replace(inputs, progress=step)
+            if before is None or method.update is None:
+                layer = method.run(inputs, chosen)
+            else:
+                layer = method.update(inputs, chosen, before)
         timings[method.name] = time.monotonic() - began
         if isinstance(layer, Refined):
             scene = refined = replace(scene, gaussians=layer.gaussians)
@@ -241,7 +254,7 @@ def segment_work(
         if merged is not None:
             layer = _panoptic(scene, layer, merged, method)
     return Segmentation(
-        layer=_described(layer, method, name, inputs, options),
+        layer=_described(layer, method, name, inputs, options, before=before),
         name=layer_name,
         evidence=inputs.evidence,
         views=views,
@@ -339,8 +352,20 @@ def _panoptic(
     return merge_panoptic(scene.gaussians, instances, *classes)
 
 
+def _with_names(before: Layer | None, inputs: MethodInputs) -> tuple[str, ...]:
+    """Names of the views that a layer was made from, those before first."""
+    known = () if before is None else before.info.views or ()
+    return (*known, *(view.name for view in inputs.views))
+
+
 def _described(
-    layer: Layer, method: Method, evidence: str, inputs: MethodInputs, options: SegmentOptions
+    layer: Layer,
+    method: Method,
+    evidence: str,
+    inputs: MethodInputs,
+    options: SegmentOptions,
+    *,
+    before: Layer | None,
 ) -> Layer:
     """The layer with a record of what it was made from; a method's own record comes first."""
     views = layer.info.views
@@ -348,7 +373,7 @@ def _described(
         layer.info,
         method=layer.info.method or method.name,
         evidence=evidence,
-        views=tuple(view.name for view in inputs.views) if views is None else views,
+        views=_with_names(before, inputs) if views is None or before is not None else views,
         views_asked=view_spec(options.views),
         seed=options.seed,
         versions=layer_versions(),

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from splatseg.core import ClassTable, Features, Labels, Scene, View
+from splatseg.core import ClassTable, Features, Labels, Layer, Scene, View
 from splatseg.core.instance_tree import layer_kind
 from splatseg.errors import InputError
 from splatseg.evaluate.metrics import psnr
@@ -127,6 +127,39 @@ def views_to_lift(work: Work, evidence: Evidence, requested: Sequence[str]) -> t
             f"{lacking[0].name}"
         )
     return views
+
+
+def layer_to_update(work: Work, method: Method, name: str) -> Layer:
+    """The layer of this name, which the method must have made and can add views to."""
+    if method.update is None:
+        raise InputError(
+            f"update: expected a method that adds views to a layer, {method.name} starts again "
+            "with all views."
+        )
+    layer = work.layer(name, option="update")
+    if layer.info.method != method.name and layer.info.method != _FUNCTIONS.get(method.name):
+        raise InputError(
+            f"update: expected a layer that {method.name} made, {name!r} was made by "
+            f"{layer.info.method}."
+        )
+    if layer.info.views is None:
+        raise InputError(f"update: layer {name!r} does not say which views it was made from.")
+    return layer
+
+
+_FUNCTIONS = {"features": "uplift_features"}
+"""What layers record where it is not the name of the method."""
+
+
+def views_to_add(views: Sequence[View], layer: Layer, name: str) -> tuple[View, ...]:
+    """The views that a layer does not have."""
+    known = set(layer.info.views or ())
+    new = tuple(view for view in views if view.name not in known)
+    if not new:
+        raise InputError(
+            f"update: layer {name!r} has all {len(views)} views with evidence already."
+        )
+    return new
 
 
 def unmasked(work: Work, evidence: Evidence, views: Sequence[View], view_masks: str) -> Evidence:

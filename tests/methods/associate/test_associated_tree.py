@@ -468,3 +468,10 @@ def test_rounds_that_keep_what_is_unchanged_are_rounds_from_nothing(seed) -> Non
     free = cluster(agreement, 0.15)
     assert not np.array_equal(found, free)
     assert np.array_equal(free, _dense_cluster(agreement, 0.15, 0 * conflicts))
+
+
+def test_masks_that_no_two_views_share_are_a_tree_of_nothing() -> None:
+    strips = {view.name: ((place,),) for place, view in enumerate(VIEWS)}
+    tree = tree_of(nested(strips))
+    assert tree.nodes == ()
+    assert set(tree.labels.ids.tolist()) == {-1}

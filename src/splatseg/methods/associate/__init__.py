@@ -48,6 +48,7 @@ from splatseg.methods.associate._levels import separated_levels
 from splatseg.methods.associate._memberships import sharpened_votes
 from splatseg.methods.associate._table import SegmentTable, segment_table
 from splatseg.methods.associate._tree import segment_tree
+from splatseg.methods.associate._update import with_views
 from splatseg.methods.associate._votes import (
     category_of,
     instance_tree,
@@ -341,6 +342,36 @@ def run(inputs: MethodInputs, options: AssociateMethodOptions) -> Labels | Insta
     )
 
 
+def update(
+    inputs: MethodInputs, options: AssociateMethodOptions, layer: Labels | InstanceTree
+) -> Labels | InstanceTree:
+    """Add the segments of further views, see `with_views`."""
+
+    def associated(source: SegmentSource, views: Sequence[View]) -> Labels | InstanceTree:
+        level = "tree" if isinstance(layer, InstanceTree) else "object"
+        return associate(
+            inputs.gaussians,
+            views,
+            source,
+            options=replace(options.association, level=level),
+            confusion=options.confusion if options.correct_confusion else None,
+            sharpen_votes=False,
+            classes=inputs.categories,
+            backend=inputs.backend,
+        )
+
+    return with_views(
+        layer,
+        inputs.gaussians,
+        inputs.views,
+        EvidenceSegments(evidence=inputs.evidence),
+        associated=associated,
+        longest_side=options.association.longest_side,
+        backend=inputs.backend,
+        progress=inputs.progress,
+    )
+
+
 METHOD = Method(
     name="associate",
     summary="segments of all views become instances by the Gaussians they share; no tracker",
@@ -348,4 +379,5 @@ METHOD = Method(
     evidence=("masks", "panoptic", "tracked"),
     options=AssociateMethodOptions,
     run=run,
+    update=update,
 )

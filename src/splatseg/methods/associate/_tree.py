@@ -239,6 +239,8 @@ def _same_nodes(
     both: NDArray[np.float64], forbidden: NDArray[np.bool_]
 ) -> NDArray[np.int64] | None:
     """Where each group goes: to the earlier of two with the same core; None if none do."""
+    if not len(both):
+        return None
     size = both.diagonal()
     ratio = both / np.maximum(size[:, None] + size[None, :] - both, 1e-12)
     ratio[forbidden] = 0

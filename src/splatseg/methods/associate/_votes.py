@@ -163,7 +163,8 @@ def tree_votes(
     labels = voter.decided(rank[group])
     rows = objects[order]
     ids = labels.ids.numpy()
-    node = np.where(ids == UNLABELLED, -1, np.append(rows, -1)[ids - 1])
+    # The last one is of Gaussians without an id.
+    node = np.append(rows, -1)[np.maximum(ids, 0) - 1]
     node = _parts(voter, node, object_of, top_part[tree.node])
     return TreeVotes(
         objects=labels,
