@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from splatseg.cli import main
 from splatseg.core import Features, Labels
 from splatseg.errors import InputError
 from splatseg.fit import FitOptions
@@ -141,6 +142,18 @@ def test_another_world_nothing_new_and_other_options_are_refused(
     with pytest.raises(InputError, match="expected a new folder"):
         fit_capture(photographs, folder, options=MakeSceneOptions(add=known), fit_options=STEPS)
     assert (folder / "file").read_text() == "mine"
+
+
+def test_the_command_adds_in_steps(known, photographs, tmp_path, capsys) -> None:
+    folder = tmp_path / "scene"
+    words = ["fit", str(photographs), "--add", str(known), "-o", str(folder)]
+    assert main([*words, "--minutes", "1"]) == 2
+    assert "photographs are added in steps (`--steps`), got minutes" in capsys.readouterr().err
+    assert not folder.exists()
+    assert main([*words, "--steps", "1", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["train_views"] == 16
+    assert (folder / "reports" / "fit.html").is_file()
 
 
 def update(root: Path, method: str, evidence: str, layer: str):
