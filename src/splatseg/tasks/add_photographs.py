@@ -28,7 +28,7 @@ from splatseg.pose.resection import Resection, resect
 from splatseg.render import BackendName
 from splatseg.tasks.work import EVIDENCE_FOLDER, Observer, check_new_folder, photographed, versions
 
-STEPS_PER_VIEW = 20
+STEPS_PER_VIEW = 5
 """Steps for each training view, known and new, where none are asked for."""
 
 _START = 0.4

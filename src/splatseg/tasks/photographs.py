@@ -80,7 +80,7 @@ class MakeSceneOptions(CheckpointOptions):
 
     add: Path | None = None
     """Scene folder that the photographs are added to: they are placed among its own, Gaussians are
-    added where it has none, and all are optimised for some steps more (steps, or 20 a view). The
+    added where it has none, and all are optimised for some steps more (steps, or 5 a view). The
     result is a new scene, with the layers and the evidence of this one."""
 
     keep_checkpoint: bool = False
