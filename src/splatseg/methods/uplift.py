@@ -3,7 +3,16 @@
 from collections.abc import Callable, Sequence
 from dataclasses import field, replace
 
-from splatseg.core import ClassTable, Features, Gaussians, Labels, LabelSource, View
+from splatseg.core import (
+    LOCAL,
+    ClassTable,
+    Executor,
+    Features,
+    Gaussians,
+    Labels,
+    LabelSource,
+    View,
+)
 from splatseg.core.options import options
 from splatseg.lift.voting.confusion import (
     CANDIDATES,
@@ -40,6 +49,7 @@ def lift_labels(
     confusion: ConfusionOptions | None = DEFAULT_CONFUSION,
     classes: ClassTable | None = None,
     backend: str = "auto",
+    executor: Executor = LOCAL,
     progress: Callable[[int, int], None] | None = None,
 ) -> Labels:
     """Label Gaussians by label maps: the votes of `uplift`, relabelled by `correct_confusion`.
@@ -53,6 +63,7 @@ def lift_labels(
             other than ``share``.
         classes: Names of the ids, for the info.
         backend: Name of the rendering backend.
+        executor: Where the views are worked on; the layer does not depend on it.
         progress: Called with the views done and all there are to do.
 
     Returns:
@@ -72,6 +83,7 @@ def lift_labels(
         options=options.with_candidates(CANDIDATES) if relabel and hard else options,
         classes=classes,
         backend=backend,
+        executor=executor,
         progress=progress,
     )
     if not relabel:
@@ -91,6 +103,7 @@ def run(inputs: MethodInputs, options: UpliftMethodOptions) -> Labels:
         confusion=options.confusion if options.correct_confusion else None,
         classes=inputs.label_names,
         backend=inputs.backend,
+        executor=inputs.executor,
         progress=inputs.progress,
     )
 
@@ -115,6 +128,7 @@ def run_features(inputs: MethodInputs, options: FeatureUpliftOptions) -> Feature
         inputs.evidence,
         options=options,
         backend=inputs.backend,
+        executor=inputs.executor,
         progress=inputs.progress,
     )
 
