@@ -300,7 +300,8 @@ def test_renders_of_views_without_photographs_are_kept_beside_each_kind(views, t
     virtual = [replace(views[0], image=None), views[1], replace(views[2], image=None)]
     request = EvidenceRequest(what=["masks", "features"], image_of=image_of)
     seen = record_evidence(Counting(), virtual, tmp_path / "e", request)
-    assert seen.drawn == 2 and drawn == ["v0", "v1", "v2"]
+    assert seen.drawn == 2
+    assert drawn == ["v0", "v1", "v2"]
     for folder in (seen.folder, seen.further[0].folder):
         evidence = open_evidence(folder)
         assert [evidence.render(name) is None for name in ("v0", "v1", "v2")] == [

@@ -218,9 +218,7 @@ class Answer:
     """The picture that it was shown, where the view has no photograph."""
 
 
-def answers_of(
-    look: Look, together: Sequence[tuple[View, Sequence[int]]]
-) -> Iterator[Answer]:
+def answers_of(look: Look, together: Sequence[tuple[View, Sequence[int]]]) -> Iterator[Answer]:
     """Answers to the questions of views that a model looks at together, in their order.
 
     A model that takes several images at once sees those of one size together.

@@ -17,7 +17,6 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Mapping
 from contextlib import ExitStack, contextmanager
 from io import BytesIO
-from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
@@ -128,6 +127,8 @@ def open_executor(
         yield executor
         if executor.items:
             observer.info(executor.summary)
+        else:
+            observer.note("executor: none of this work went to workers; it is done in one process")
 
 
 def _check_answers(address: tuple[str, int]) -> None:
@@ -190,8 +191,7 @@ class RayExecutor:
         Raises:
             BackendError: If the workers of an item died again and again.
         """
-        if self._task is None:
-            self._start()
+        self._task = run = self._task or self._started()
         packed = _packed(shared)
         self.bytes_put += _size(packed)
         # In a list, or it would be fetched anew for each item.
@@ -210,7 +210,7 @@ class RayExecutor:
                     except StopIteration:
                         more = False
                         continue
-                    pending.append(self._task.remote(function, put, item, self._options.task_cpus))
+                    pending.append(run.remote(function, put, item, self._options.task_cpus))
                 elif more and room and pending[0] in unfinished:
                     self._ray.wait(unfinished, num_returns=1)
                 else:
@@ -246,8 +246,8 @@ class RayExecutor:
         self.cpu_seconds += seconds
         return results
 
-    def _start(self) -> None:
-        """Join the cluster, and see what it has."""
+    def _started(self) -> Any:
+        """What calls a function in a worker: the cluster is joined, and has room for workers."""
         self._begun = time.monotonic()
         ray, options = self._ray, self._options
         joined = ray.is_initialized()
@@ -270,7 +270,7 @@ class RayExecutor:
         own = not joined and options.address is None
         # A cluster of our own has no more CPUs; it may have the next items waiting.
         self._most_unfinished = self._workers * (_AHEAD if own else 1)
-        self._task = ray.remote(_run).options(
+        return ray.remote(_run).options(
             num_cpus=options.task_cpus,
             num_gpus=options.task_gpus,
             memory=resources["memory"] or None,

@@ -170,9 +170,7 @@ def segment(
         ShapeError: If evidence does not have its photograph's proportions.
         KeyboardInterrupt: If it was interrupted; the message says how to go on.
     """
-    work = Work(
-        scene=scene, layers=layers, backend=backend, observer=observer, executor=executor
-    )
+    work = Work(scene=scene, layers=layers, backend=backend, observer=observer, executor=executor)
     method = find_method(method) if isinstance(method, str) else method
     return segment_work(
         work,

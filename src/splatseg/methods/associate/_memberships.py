@@ -213,6 +213,7 @@ def fit_memberships(
         start: scipy rows (Gaussians, ids) of float32: what is known of each Gaussian before, such
             as its votes, in [0, 1]. Ids it does not have there, it cannot get.
         backend: Name of the rendering backend.
+        executor: Where rows of W are found; the memberships do not depend on it.
 
     Returns:
         scipy rows (Gaussians, ids) with the entries of `start`, values in [0, 1].
@@ -341,7 +342,6 @@ def painted(
         source: Where their pixels are.
         longest_side: Larger maps are reduced to it, in pixels.
     """
-
     return _Painting(
         rows={name: np.flatnonzero(table.view == index) for index, name in enumerate(table.views)},
         name=table.name,

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,10 +43,10 @@ class ViewEntries(NamedTuple):
     gaussian: NDArray[np.int32]
     mass: NDArray[np.float32]
     seen: NDArray[np.float32]
-    covered: NDArray[np.float32]
+    covered: NDArray[Any]
     """What of each Gaussian lies in some segment, in pixels of the segments as they came."""
 
-    visible: NDArray[np.float32]
+    visible: NDArray[Any]
     """The same of what the view sees."""
 
 
