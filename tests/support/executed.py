@@ -34,12 +34,17 @@ def failing(shared: int, item: int) -> Iterator[int]:
     yield item
 
 
-def together(folder: Path, item: int) -> Iterator[int]:
-    """How many items are worked on at a time."""
+def together(shared: tuple[Path, int], item: int) -> Iterator[int]:
+    """How many items are worked on at a time: waits a while for so many."""
+    folder, expected = shared
     own = folder / str(item)
     own.touch()
+    until = time.monotonic() + (60 if expected > 1 else 0.3)
+    found = 0
+    while found < max(2, expected) and time.monotonic() < until:
+        found = max(found, len(list(folder.iterdir())))
+        time.sleep(0.01)
     time.sleep(0.1)
-    found = len(list(folder.iterdir()))
     own.unlink()
     yield found
 

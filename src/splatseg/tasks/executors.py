@@ -16,6 +16,7 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Mapping
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from io import BytesIO
 from typing import Annotated, Any, TypeVar
 
@@ -284,6 +285,7 @@ class RayExecutor:
 
     def _join(self) -> None:
         ray, options = self._ray, self._options
+        _print_on_stderr(ray)
         told = {"log_to_driver": False, "logging_level": "ERROR"}
         if options.address is None:
             cores = os.cpu_count() or 1
@@ -320,6 +322,23 @@ def _fitting(node: Mapping[str, float], resources: Mapping[str, float]) -> int:
 def _in_words(resources: Mapping[str, float]) -> str:
     cpus, gpus, memory = (resources.get(name, 0.0) for name in ("CPU", "GPU", "memory"))
     return f"{cpus:g} CPUs, {gpus:g} GPUs, {memory / _GIGABYTE:.1f} GB"
+
+
+def _print_on_stderr(ray: Any) -> None:
+    """Have what Ray tells of its processes on stderr: on stdout are results, which programs read.
+
+    Such as that a worker died. Ray has no switch for it.
+    """
+    module = ray._private.worker
+    printed = module.print_to_stdstream
+    if not isinstance(printed, partial):
+        module.print_to_stdstream = partial(_printed_as_error, printed)
+
+
+def _printed_as_error(
+    printed: Callable[..., None], data: Mapping[str, Any], *args: Any, **kwargs: Any
+) -> None:
+    printed({**data, "is_err": True}, *args, **kwargs)
 
 
 @contextmanager
