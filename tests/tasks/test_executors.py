@@ -3,7 +3,9 @@
 import os
 import shutil
 import socket
+import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import closing
@@ -37,6 +39,7 @@ from splatseg.tasks import (
     RenderingOptions,
     SeeOptions,
     SegmentOptions,
+    executors,
     open_executor,
     render_views,
     see,
@@ -265,16 +268,52 @@ def test_without_the_package(monkeypatch) -> None:
         pass
 
 
-def test_an_address_at_which_nothing_answers() -> None:
+@pytest.mark.parametrize("said", [None, b"", b"HTTP/1.1 400 Bad Request"])
+def test_an_address_at_which_no_cluster_answers(said, monkeypatch) -> None:
+    """Nobody listens; one that says nothing; one that says something else."""
     pytest.importorskip("ray")
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    with (
-        pytest.raises(InputError, match=f"a Ray cluster at 127.0.0.1:{port}, but nothing answers"),
-        open_executor(ExecutorOptions(executor=f"ray://127.0.0.1:{port}")),
-    ):
-        pass
+    monkeypatch.setattr(executors, "_SECONDS", 0.3)
+    with socket.socket() as server:
+        server.bind(("127.0.0.1", 0))
+        port = server.getsockname()[1]
+        if said is not None:
+            server.listen()
+            answering = threading.Thread(target=lambda: answer(server, said))
+            answering.start()
+        with (
+            pytest.raises(InputError, match=f"cluster at 127.0.0.1:{port}, but none answers there"),
+            open_executor(ExecutorOptions(executor=f"ray://127.0.0.1:{port}")),
+        ):
+            pass
+        if said is not None:
+            answering.join()
+
+
+def answer(server: socket.socket, said: bytes) -> None:
+    connection, _ = server.accept()
+    with connection:
+        connection.sendall(said)
+        time.sleep(0.5)
+
+
+def test_a_cluster_that_runs_is_joined(ray, tmp_path) -> None:
+    """By another process, as its driver; it goes on without it."""
+    address = ray.get_runtime_context().gcs_address
+    script = (
+        "import os\n"
+        "from splatseg.tasks import ExecutorOptions, open_executor\n"
+        "from support import executed\n"
+        f"options = ExecutorOptions(executor='ray://{address}')\n"
+        "with open_executor(options) as executor:\n"
+        "    print(list(executor.map(executed.twice, [5], shared=1)))\n"
+    )
+    environment = dict(os.environ) | {"RAY_AUTH_MODE": "disabled"}
+    done = subprocess.run(
+        [sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True
+    )
+    assert done.stdout == "[6, 5]\n"
+    with open_executor(ExecutorOptions(executor="ray")) as executor:
+        assert list(executor.map(executed.twice, [5], shared=1)) == [6, 5]
 
 
 def test_what_did_not_go_to_workers_is_said(ray) -> None:

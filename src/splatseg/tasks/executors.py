@@ -48,6 +48,11 @@ _AHEAD = 2
 _SECONDS = 5.0
 """In which a cluster must answer."""
 
+_SETTINGS = bytes((0, 0, 0, 4, 0, 0, 0, 0, 0))
+"""The frame by which either side of HTTP/2 begins: of length 0 and type 4."""
+
+_HELLO = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + _SETTINGS
+
 _GIGABYTE = 1 << 30
 
 _OWN_CLUSTER = {
@@ -138,13 +143,21 @@ def open_executor(
 
 
 def _check_answers(address: tuple[str, int]) -> None:
+    """Refuse an address where nothing speaks HTTP/2, for which Ray itself waits for minutes."""
     try:
-        socket.create_connection(address, timeout=_SECONDS).close()
+        with socket.create_connection(address, timeout=_SECONDS) as connection:
+            if os.environ.get("RAY_USE_TLS", "0") != "0":
+                return
+            connection.sendall(_HELLO)
+            if connection.recv(4)[3:] == _SETTINGS[3:4]:
+                return
+            why = "it speaks something else"
     except OSError as error:
-        raise InputError(
-            f"executor: expected a Ray cluster at {address[0]}:{address[1]}, but nothing answers "
-            f"there ({reason(error)}); `ray start --head` on a machine begins one."
-        ) from error
+        why = reason(error)
+    raise InputError(
+        f"executor: expected a Ray cluster at {address[0]}:{address[1]}, but none answers there "
+        f"({why}); `ray start --head` on a machine begins one."
+    )
 
 
 class RayExecutor:
