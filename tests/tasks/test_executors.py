@@ -1,5 +1,6 @@
 """Executors: one contract, held by all; what Ray's workers make has the bits of one process."""
 
+import json
 import os
 import shutil
 import socket
@@ -18,6 +19,7 @@ import numpy as np
 import pytest
 import torch
 
+from splatseg.cli import main
 from splatseg.core import LOCAL, Executor
 from splatseg.core.executor import ThreadExecutor
 from splatseg.errors import (
@@ -434,3 +436,38 @@ def test_renders_have_the_same_bytes(workers, room, tmp_path) -> None:
         render_views(room.scene, tmp_path / name, options=options, layers=layers, executor=way)
     assert workers.items == len(room.scene.test_views)
     assert files(tmp_path / "one") == files(tmp_path / "other")
+
+
+# The commands.
+
+
+@pytest.mark.parametrize(
+    ("words", "items"),
+    [
+        ("segment {} --method uplift --evidence labels_semantic --layer l", "train"),
+        ("see {} --model classical --evidence seen", "train"),
+        ("render {} -o {}/drawn", "test"),
+    ],
+)
+def test_commands_take_workers(ray, fitted_room, tmp_path, capfd, words, items) -> None:
+    """What went to them is told; on stdout there is one object."""
+    folder = tmp_path / "scene"
+    shutil.copytree(fitted_room, folder)
+    given = [word.replace("{}", str(folder)) for word in words.split()]
+    assert main([*given, "--executor", "ray", "--workers", "1", "--json"]) == 0
+    shown = capfd.readouterr()
+    assert isinstance(json.loads(shown.out), dict)
+    scene = load_scene(fitted_room)
+    count = len([view for view in scene.views if view.split == items])
+    assert f"ray: {count} items by 1 workers in " in shown.err
+
+
+def test_commands_refuse_what_cannot_be(fitted_room, tmp_path, capfd) -> None:
+    words = ["render", str(fitted_room), "-o", str(tmp_path / "o")]
+    for wrong, sentence in (
+        (["--executor", "ray", "--workers", "0"], "workers: expected at least 1, got 0"),
+        (["--workers", "2"], "go with executor ray, got local"),
+        (["--surface", "m.ply", "--executor", "ray"], "executor: expected none with a surface"),
+    ):
+        assert main([*words, *wrong]) == 2
+        assert sentence in " ".join(capfd.readouterr().err.split())
