@@ -54,9 +54,17 @@ def looked_at(shared: Any, item: int) -> Iterator[tuple[int, int, int, int]]:
     yield os.getpid(), threads(), torch.get_num_threads(), shared.data_ptr()
 
 
+def late(folder: Path, item: int) -> Iterator[int]:
+    """Takes a second, but for the first item, and notes that it got to its end."""
+    time.sleep(min(item, 1))
+    (folder / str(item)).touch()
+    yield item
+
+
 def sums(shared: Any, item: int) -> Iterator[Any]:
-    """A row of a tensor, which the caller may write to."""
+    """A row of a tensor, and as an array."""
     yield shared[item] + 1
+    yield (shared[item] + 1).numpy()
 
 
 @dataclass(frozen=True)

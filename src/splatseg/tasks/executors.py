@@ -343,8 +343,8 @@ def _print_on_stderr(ray: Any) -> None:
     Such as that a worker died. Ray has no switch for it.
     """
     module = ray._private.worker
-    printed = module.print_to_stdstream
-    if not isinstance(printed, partial):
+    printed = getattr(module, "print_to_stdstream", None)
+    if printed is not None and not isinstance(printed, partial):
         module.print_to_stdstream = partial(_printed_as_error, printed)
 
 
