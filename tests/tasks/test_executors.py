@@ -148,11 +148,14 @@ def test_one_that_is_closed_begins_no_further_item(executor, tmp_path) -> None:
 
 
 def test_what_is_closed_ends_what_runs(workers, tmp_path) -> None:
-    found = workers.map(executed.late, range(6), shared=tmp_path)
+    (there := tmp_path / "there").mkdir()
+    assert max(workers.map(executed.together, range(4), shared=(there, 2))) == 2, "both run"
+    (folder := tmp_path / "late").mkdir()
+    found = workers.map(executed.late, range(6), shared=folder)
     assert next(found) == 0
     found.close()
     time.sleep(2)
-    assert [path.name for path in tmp_path.iterdir()] == ["0"]
+    assert [path.name for path in folder.iterdir()] == ["0"]
 
 
 def test_shared_values_lie_in_a_worker_once(workers) -> None:
