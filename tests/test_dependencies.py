@@ -123,7 +123,7 @@ def test_every_requirement_has_one_minimum_that_scripts_oldest_installs() -> Non
     assert len(names) == len(set(names)), "two minimums of one package"
     assert all("==" in pin for pin in pins), pins
     assert set(names) == listed(
-        "sfm", "video", "las", "mesh", "waymo", "viewer", "models", "hed", "dev"
+        "sfm", "video", "las", "mesh", "waymo", "viewer", "models", "ray", "hed", "dev"
     ) - {
         "torch",
         "ruff",

@@ -1,6 +1,7 @@
 """Evidence written: several kinds of one model, several images at once, depth."""
 
 import threading
+from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
@@ -16,7 +17,6 @@ from splatseg.io.evidence import open_evidence, save_depth_map, save_label_map
 from splatseg.io.images import load_image
 from splatseg.models import EvidenceRequest, record_evidence, recorded_model
 from splatseg.models._images import LastImages
-from splatseg.models._written import Pictures
 from splatseg.render.cpu import set_threads
 
 
@@ -89,7 +89,7 @@ def test_masks_that_are_there_are_not_found_again(views, tmp_path) -> None:
 def test_several_kinds_read_each_photograph_once(views, tmp_path) -> None:
     read: list[str] = []
 
-    def image_of(view, _folder):
+    def image_of(view):
         read.append(view.name)
         return load_image(view)
 
@@ -124,13 +124,13 @@ def test_pictures_that_are_given_go_together_too(views, tmp_path) -> None:
     """`see` gives them: photographs, and renders of views that have none."""
     model, given = Counting(), []
 
-    def image_of(view, folder):
-        given.append((view.name, folder))
+    def image_of(view):
+        given.append(view.name)
         return load_image(view)
 
     record_evidence(model, views, tmp_path / "e", EvidenceRequest(what="masks", image_of=image_of))
     assert model.passes == [2, 1]
-    assert given == [(name, tmp_path / "e") for name in ("v0", "v1", "v2")], "each once"
+    assert given == ["v0", "v1", "v2"], "each once"
 
 
 def test_what_is_done_of_each_kind_stays(views, tmp_path) -> None:
@@ -176,8 +176,6 @@ def test_kinds_that_cannot_be(views, tmp_path: Path) -> None:
 
 
 def test_images_of_different_sizes_are_not_put_together(views, tmp_path, rng) -> None:
-    from dataclasses import replace
-
     from PIL import Image
 
     camera = views[0].camera
@@ -291,11 +289,23 @@ def test_what_is_refused(views, tmp_path) -> None:
         )
 
 
-def test_a_picture_that_another_thread_forgets_is_still_given(views, tmp_path) -> None:
-    class Forgetful(dict):
-        def __setitem__(self, key, value) -> None:
-            """Gone at once, as if the thread that writes came in between."""
+def test_renders_of_views_without_photographs_are_kept_beside_each_kind(views, tmp_path) -> None:
+    """Each is drawn once; the views that have a photograph need none."""
+    drawn: list[str] = []
 
-    pictures = Pictures(None)
-    pictures._kept = Forgetful()
-    assert torch.equal(pictures.of(views[0], tmp_path), load_image(views[0]))
+    def image_of(view):
+        drawn.append(view.name)
+        return load_image(next(one for one in views if one.name == view.name))
+
+    virtual = [replace(views[0], image=None), views[1], replace(views[2], image=None)]
+    request = EvidenceRequest(what=["masks", "features"], image_of=image_of)
+    seen = record_evidence(Counting(), virtual, tmp_path / "e", request)
+    assert seen.drawn == 2
+    assert drawn == ["v0", "v1", "v2"]
+    for folder in (seen.folder, seen.further[0].folder):
+        evidence = open_evidence(folder)
+        assert [evidence.render(name) is None for name in ("v0", "v1", "v2")] == [
+            False, True, False,
+        ]  # fmt: skip
+        with Picture.open(evidence.render("v0")) as kept:
+            assert np.array_equal(np.array(kept), load_image(views[0]).numpy())

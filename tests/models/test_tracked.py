@@ -441,7 +441,7 @@ def test_pictures_are_taken_one_at_a_time(moving, masks, tmp_path) -> None:
     taken: list[str] = []
     told: list[tuple[int, int]] = []
 
-    def image_of(view, _folder):
+    def image_of(view):
         from splatseg.io.images import load_image
 
         taken.append(view.name)

@@ -5,8 +5,8 @@ import shlex
 import sys
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias, TypeVar
 
@@ -23,12 +23,12 @@ from rich.text import Text
 from typing_extensions import override
 
 from splatseg.cli._streams import tell
-from splatseg.core import Scene
+from splatseg.core import Executor, Scene
 from splatseg.errors import visible
 from splatseg.io.scene import load_scene
 from splatseg.io.splats import Values
 from splatseg.render import BackendName
-from splatseg.tasks import Observer
+from splatseg.tasks import ExecutorOptions, Observer, open_executor
 from splatseg.tasks.work import Step
 
 T = TypeVar("T")
@@ -153,6 +153,18 @@ class OnScene(Printing):
     def open(self) -> Scene:
         """The scene."""
         return load_scene(self.scene, data=self.data)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OnViews(OnScene):
+    """A command that works on the views of a scene, each by itself."""
+
+    executing: tyro.conf.OmitArgPrefixes[ExecutorOptions] = field(default_factory=ExecutorOptions)
+    """Where views are worked on."""
+
+    def open_executor(self) -> AbstractContextManager[Executor]:
+        """What works on them."""
+        return open_executor(self.executing, observer=self.observer)
 
 
 SECONDS_BETWEEN_LINES = 10.0

@@ -7,17 +7,17 @@ from typing import Annotated
 
 import tyro
 
-from splatseg.cli._shared import Field, OnScene, print_result
+from splatseg.cli._shared import Field, OnViews, print_result
 from splatseg.errors import InputError
 from splatseg.evaluate import PointSurfaceOptions
 from splatseg.io.captures import read_capture
 from splatseg.io.scene_folder import is_scene
-from splatseg.tasks import Rendering, RenderingOptions, render_truth, render_views
+from splatseg.tasks import ExecutorOptions, Rendering, RenderingOptions, render_truth, render_views
 from splatseg.tasks.work import scene_field
 
 
 @dataclass(frozen=True, kw_only=True)
-class Command(OnScene):
+class Command(OnViews):
     """Draw views of a scene: DIR/<what>/<view>.png, in the photographs' own pixels.
 
     rgb and alpha have 8 bit. depth has 16 bit: z-depth with the unit in depth.json, 0 where alpha
@@ -38,6 +38,8 @@ class Command(OnScene):
     splatseg render room -o renders --what rgb,depth,semantic --coloured
 
     splatseg render room -o path --split path --frames 240 --video
+
+    splatseg render city -o path --split path --video --executor ray
 
     splatseg render scan -o truth --surface scan_vh_clean_2.labels.ply
     """
@@ -78,14 +80,16 @@ def run(command: Command) -> None:
     if command.surface is None:
         _check_without_surface(command)
         scene = command.open()
-        done = render_views(
-            scene,
-            command.output,
-            options=command.rendering,
-            field=None if command.field is None else scene_field(scene, command.field),
-            backend=command.backend,
-            observer=command.observer,
-        )
+        with command.open_executor() as executor:
+            done = render_views(
+                scene,
+                command.output,
+                options=command.rendering,
+                field=None if command.field is None else scene_field(scene, command.field),
+                backend=command.backend,
+                executor=executor,
+                observer=command.observer,
+            )
     else:
         done = _truth(command, command.surface)
     facts = {
@@ -107,6 +111,8 @@ def _check_without_surface(command: Command) -> None:
 def _truth(command: Command, path: Path) -> Rendering:
     if command.field is not None:
         raise InputError("field: expected none with a surface, which is drawn instead of it.")
+    if command.executing != ExecutorOptions():
+        raise InputError("executor: expected none with a surface, which is drawn in this process.")
     options = command.rendering
     if options.what == RenderingOptions().what:
         options = replace(options, what=())

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from splatseg.cli._shared import OnScene, print_result
+from splatseg.cli._shared import OnViews, print_result
 from splatseg.cli._words import option_value
 from splatseg.models import (
     DescribedEvidence,
@@ -24,7 +24,7 @@ CONFIG = (tyro.conf.HelptextFromCommentsOff,)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Command(OnScene):
+class Command(OnViews):
     """Run a 2D model on a scene's photographs, and record its predictions.
 
     The evidence is written to SCENE/evidence/NAME, one file per view. Work that was stopped
@@ -37,6 +37,8 @@ class Command(OnScene):
     splatseg see room --model dinov2 --weights facebook/dinov2-base --download --evidence dino
 
     splatseg see room --model sam2-video --seeds masks --evidence tracks
+
+    splatseg see city --model sam2 --evidence masks --executor ray://10.0.0.1:6379 --task-gpus 1
 
     splatseg see room --model sam-masks --evidence masks_sam --views all --allow-missing
 
@@ -156,16 +158,18 @@ def _with_summaries() -> type[Any]:
 
 def run(command: Command) -> None:
     """See a scene."""
-    seen = see(
-        command.open(),
-        command.model,
-        command.evidence,
-        options=command.seeing,
-        model_options=command.options,
-        loading=None if command.loading == LoadOptions() else command.loading,
-        backend=command.backend,
-        observer=command.observer,
-    )
+    with command.open_executor() as executor:
+        seen = see(
+            command.open(),
+            command.model,
+            command.evidence,
+            options=command.seeing,
+            model_options=command.options,
+            loading=None if command.loading == LoadOptions() else command.loading,
+            backend=command.backend,
+            executor=executor,
+            observer=command.observer,
+        )
     facts = {
         "evidence": seen.folder,
         "kind": seen.kind,

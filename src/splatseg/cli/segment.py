@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar
 
 import tyro
 
-from splatseg.cli._shared import OnScene, print_result, typed
+from splatseg.cli._shared import OnViews, print_result, typed
 from splatseg.cli._words import option_value
 from splatseg.core import UNLABELLED, Features, Selection, VoxelFeatures
 from splatseg.core.instance_tree import layer_kind
@@ -50,7 +50,7 @@ _COMPLETION = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class Command(OnScene):
+class Command(OnViews):
     """Lift evidence of the photographs onto the Gaussians: it becomes a layer.
 
     The layer is written to SCENE/layers and replaces an older layer of the same name. Ctrl-C ends
@@ -64,6 +64,8 @@ class Command(OnScene):
     splatseg segment room --method associate --evidence masks --layer objects --export --report
 
     splatseg segment room --method vote --evidence labels_tracked --views all --json
+
+    splatseg segment city --method uplift --evidence labels --executor ray --workers 16
     """
 
     REMOVED: ClassVar[dict[str, str]] = {
@@ -168,15 +170,17 @@ def run(command: Command) -> None:
     # Until all of it is written, no other process may change the scene.
     writes = ["layers", *(["reports"] if command.report else [])]
     with work_on_scene(command.scene, "segment", writes=writes):
-        result = segment(
-            scene,
-            method,
-            options=command.shared,
-            method_options=command.options,
-            checkpoints=command.checkpoint,
-            backend=command.backend,
-            observer=observer,
-        )
+        with command.open_executor() as executor:
+            result = segment(
+                scene,
+                method,
+                options=command.shared,
+                method_options=command.options,
+                checkpoints=command.checkpoint,
+                backend=command.backend,
+                executor=executor,
+                observer=observer,
+            )
         if command.export:
             check_layer_exports(scene, command.scene, result.name)
         path = save_segmentation(result, command.scene)

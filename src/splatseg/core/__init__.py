@@ -18,6 +18,8 @@ from splatseg.core.evidence import SegmentSource as SegmentSource
 from splatseg.core.evidence import Track as Track
 from splatseg.core.evidence import ViewNames as ViewNames
 from splatseg.core.evidence import map_ids as map_ids
+from splatseg.core.executor import LOCAL as LOCAL
+from splatseg.core.executor import Executor as Executor
 from splatseg.core.gaussians import Gaussians as Gaussians
 from splatseg.core.instance_tree import FlatLayer as FlatLayer
 from splatseg.core.instance_tree import InstanceTree as InstanceTree

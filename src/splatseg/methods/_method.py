@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, fields, is_dataclass
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Literal, cast
 
-from splatseg.core import ClassTable, Features, Gaussians, Layer, View
+from splatseg.core import LOCAL, ClassTable, Executor, Features, Gaussians, Layer, View
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.checkpoints import Checkpoints
 from splatseg.errors import InputError, MissingPackageError
@@ -56,6 +56,9 @@ class MethodInputs:
 
     backend: str = "auto"
     """Name of the rendering backend."""
+
+    executor: Executor = LOCAL
+    """Where independent items are worked on, such as views; the layer does not depend on it."""
 
     seed: int = 0
     """Of all random choices; a method that declares itself not seeded makes none."""

@@ -15,8 +15,10 @@ from torch import Tensor
 from splatseg.core import (
     JSON,
     LEARNED_BYTES,
+    LOCAL,
     LOSS_CURVE,
     ClassTable,
+    Executor,
     Features,
     Gaussians,
     Labels,
@@ -148,6 +150,9 @@ class TrainingContext:
 
     backend: str = "auto"
     """Name of the rendering backend."""
+
+    executor: Executor = LOCAL
+    """Where views are worked on before the training."""
 
     progress: Callable[[int, int], None] | None = None
     """Called after each step with the steps done and all there are to do."""
@@ -285,6 +290,7 @@ def context_of(inputs: MethodInputs) -> TrainingContext:
     """What a method was given, as a training takes it."""
     return TrainingContext(
         backend=inputs.backend,
+        executor=inputs.executor,
         progress=inputs.progress,
         checkpoints=inputs.checkpoints,
         seed=inputs.seed,

@@ -84,7 +84,11 @@ def run(inputs: MethodInputs, options: ObjectFeaturesOptions) -> Features:
             "masks: expected evidence of masks, such as masks_sam, to find objects by, got none."
         )
     found = associate(
-        inputs.gaussians, inputs.views, EvidenceSegments(evidence=masks), backend=inputs.backend
+        inputs.gaussians,
+        inputs.views,
+        EvidenceSegments(evidence=masks),
+        backend=inputs.backend,
+        executor=inputs.executor,
     )
     objects = found.cut("object") if isinstance(found, InstanceTree) else found
     solved = object_features(

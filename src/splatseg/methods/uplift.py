@@ -5,7 +5,16 @@ from dataclasses import field, replace
 
 import torch
 
-from splatseg.core import ClassTable, Features, Gaussians, Labels, LabelSource, View
+from splatseg.core import (
+    LOCAL,
+    ClassTable,
+    Executor,
+    Features,
+    Gaussians,
+    Labels,
+    LabelSource,
+    View,
+)
 from splatseg.core.options import options
 from splatseg.errors import InputError
 from splatseg.lift.voting.confusion import (
@@ -44,6 +53,7 @@ def lift_labels(
     confusion: ConfusionOptions | None = DEFAULT_CONFUSION,
     classes: ClassTable | None = None,
     backend: str = "auto",
+    executor: Executor = LOCAL,
     progress: Callable[[int, int], None] | None = None,
 ) -> Labels:
     """Label Gaussians by label maps: the votes of `uplift`, relabelled by `correct_confusion`.
@@ -57,6 +67,7 @@ def lift_labels(
             other than ``share``.
         classes: Names of the ids, for the info.
         backend: Name of the rendering backend.
+        executor: Where the views are worked on; the layer does not depend on it.
         progress: Called with the views done and all there are to do.
 
     Returns:
@@ -76,6 +87,7 @@ def lift_labels(
         options=options.with_candidates(CANDIDATES) if relabel and hard else options,
         classes=classes,
         backend=backend,
+        executor=executor,
         progress=progress,
     )
     if not relabel:
@@ -95,6 +107,7 @@ def run(inputs: MethodInputs, options: UpliftMethodOptions) -> Labels:
         confusion=options.confusion if options.correct_confusion else None,
         classes=inputs.label_names,
         backend=inputs.backend,
+        executor=inputs.executor,
         progress=inputs.progress,
     )
 
@@ -108,6 +121,7 @@ def update(inputs: MethodInputs, options: UpliftMethodOptions, layer: Labels) ->
         options=options.votes.with_candidates(CANDIDATES),
         classes=inputs.label_names,
         backend=inputs.backend,
+        executor=inputs.executor,
         progress=inputs.progress,
     )
     names = {**votes.info.names, **layer.info.names}
@@ -135,6 +149,7 @@ def run_features(inputs: MethodInputs, options: FeatureUpliftOptions) -> Feature
         inputs.evidence,
         options=options,
         backend=inputs.backend,
+        executor=inputs.executor,
         progress=inputs.progress,
     )
 

@@ -6,8 +6,8 @@ A folder of evidence is begun, gone on with, replaced or finished here; writers 
 import importlib.metadata
 import shutil
 import time
-from collections.abc import Callable, Generator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
@@ -15,9 +15,10 @@ from typing import Any, cast
 from jaxtyping import Float
 from torch import Tensor
 
-from splatseg.core import View
+from splatseg.core import LOCAL, Executor, View
 from splatseg.core.boundary import boundary
 from splatseg.core.checkpoints import ABSENT, OptionDifference, option_differences
+from splatseg.core.executor import ThreadExecutor
 from splatseg.core.models import (
     DepthAwareMasks,
     Image,
@@ -48,14 +49,16 @@ from splatseg.io.json_files import json_text, parse_object
 from splatseg.models._tracked import TrackingEvidence, TrackingOptions
 from splatseg.models._weights import What
 from splatseg.models._written import (
+    Answer,
     ComputedEvidence,
     CopiedEvidence,
     EvidenceWriter,
-    Pictures,
+    Look,
     ability,
-    announce,
+    answers_of,
     batch_of,
     some,
+    threads_for,
 )
 from splatseg.models.recorded import RecordedModel
 
@@ -92,10 +95,9 @@ class EvidenceRequest:
     tracking: TrackingOptions | None = None
     """Which of the seeds count, and the order of the views."""
 
-    image_of: Callable[[View, Path], Image] | None = None
-    """Gives the picture of a view that the model is to see, in the pixels of its camera, and may
-    keep it in the folder where the evidence is being written, which it is given too. None takes
-    photographs."""
+    image_of: Callable[[View], Image] | None = None
+    """Gives the picture of a view that the model is to see, in the pixels of its camera. That of a
+    view without a photograph is kept beside the evidence. None takes photographs."""
 
     depth_of: Callable[[View], Float[Tensor, "height width"]] | None = None
     """Gives the z-depth of a view, 0 where there is nothing, to a model whose masks go by it."""
@@ -119,6 +121,9 @@ class DescribedEvidence:
     masks: int | None
     """Masks of the views written now; None where the kind has none."""
 
+    drawn: int
+    """Views written now that have no photograph, and whose renders were kept."""
+
     seconds: float
     """Wall time of the views written now."""
 
@@ -139,6 +144,7 @@ def record_evidence(
     folder: Path | str,
     request: EvidenceRequest = EvidenceRequest(),
     *,
+    executor: Executor = LOCAL,
     progress: Callable[[int, int], None] | None = None,
 ) -> DescribedEvidence:
     """Write what a model sees in views, one view at a time; a second call does what is left.
@@ -151,6 +157,8 @@ def record_evidence(
         views: The views to look at.
         folder: Where to write, usually SCENE/evidence/NAME. Its parent must exist.
         request: What the model is asked for, and how it is written.
+        executor: Where a model looks at views; the files do not depend on it. Recorded evidence is
+            copied, and a tracker runs, in this process.
         progress: Called with the number of views done and of all.
 
     Raises:
@@ -163,12 +171,11 @@ def record_evidence(
     if not views:
         raise InputError("views: expected at least one view, got none.")
     questions = _distinct(request.what)
-    pictures = Pictures(request.image_of)
     if request.depth_of is not None and not isinstance(model, DepthAwareMasks):
         raise InputError(
             f"depth_from_scene: expected a model that takes depth, got {model.name!r}."
         )
-    writers = _writers(model, views, questions, request, pictures)
+    writers = _writers(model, views, questions, request)
     folder = Path(folder)
     folders = [folder, *(folder.with_name(f"{folder.name}.{one}") for one in questions[1:])]
     for writer, target in zip(writers, folders, strict=True):
@@ -185,23 +192,25 @@ def record_evidence(
         ]
         done = frozenset.intersection(*(target.done for target in targets))
         todo = [view for view in wanted if view.name not in done]
-        for target in targets:
-            stack.enter_context(target.begun(todo))
-        for first in range(0, len(todo), batch_of(model)):
-            together = todo[first : first + batch_of(model)]
+        batches = [todo[i : i + batch_of(model)] for i in range(0, len(todo), batch_of(model))]
+        answers = stack.enter_context(
+            closing(_answers(model, targets, batches, request, executor=executor))
+        )
+        written = len(done)
+        for together in batches:
             if progress is not None:
-                progress(len(done) + first, len(wanted))
-            pictures.forget()
-            announce(model, [(target.writer, target.folder) for target in targets], together)
+                progress(written, len(wanted))
             for view in together:
                 for target in targets:
-                    target.write(view)
+                    target.write(view, answers)
+            written += len(together)
         if progress is not None:
             progress(len(wanted), len(wanted))
         seconds = time.monotonic() - started
         for target in targets:
             target.finish()
-    seen = [target.seen(model.name, seconds) for target in targets]
+    drawn = sum(view.image is None for view in todo)
+    seen = [target.seen(model.name, seconds, drawn=drawn) for target in targets]
     return replace(seen[0], further=tuple(seen[1:]))
 
 
@@ -218,7 +227,6 @@ def _writers(
     views: Sequence[View],
     questions: Sequence[What | None],
     request: EvidenceRequest,
-    pictures: Pictures,
 ) -> Sequence[EvidenceWriter]:
     """What writes the answers to each question; a tracker goes through all views."""
     if not isinstance(model, RecordedModel) and "tracked" in [
@@ -230,7 +238,7 @@ def _writers(
         tracker = cast(MaskTracker, model)
         return [
             TrackingEvidence(
-                tracker, views, seeds=request.seeds, options=options, pictures=pictures
+                tracker, views, seeds=request.seeds, options=options, image_of=request.image_of
             )
         ]
     if request.seeds is not None or request.tracking is not None:
@@ -238,10 +246,36 @@ def _writers(
     if isinstance(model, RecordedModel):
         missing = request.allow_missing
         return [CopiedEvidence(model, views, one, allow_missing=missing) for one in questions]
-    depth = request.depth_of
-    return [
-        ComputedEvidence(model, views, one, pictures=pictures, depth_of=depth) for one in questions
+    with_depth = request.depth_of is not None
+    return [ComputedEvidence(model, views, one, with_depth=with_depth) for one in questions]
+
+
+def _answers(
+    model: Model,
+    targets: Sequence["_Target"],
+    batches: Sequence[Sequence[View]],
+    request: EvidenceRequest,
+    *,
+    executor: Executor,
+) -> Generator[Answer]:
+    """What the model says, in the order in which it is written; nothing where it is not run."""
+    if not all(isinstance(target.writer, ComputedEvidence) for target in targets):
+        return
+    look = Look(
+        model=model,
+        what=tuple(target.writer.what for target in targets),
+        image_of=request.image_of,
+        depth_of=request.depth_of,
+    )
+    threads = threads_for(model, look.what, sum(map(len, batches)))
+    if executor is LOCAL and threads > 1:
+        executor = ThreadExecutor(threads)
+    asked = [
+        [(view, [i for i, one in enumerate(targets) if one.lacks(view)]) for view in together]
+        for together in batches
     ]
+    with closing(executor.map(answers_of, asked, shared=look)) as found:
+        yield from found
 
 
 def _check_apart(target: Path, reads: Path | None) -> None:
@@ -268,23 +302,19 @@ class _Target:
     done: frozenset[str]
     masks: int = 0
 
-    @contextmanager
-    def begun(self, views: Sequence[View]) -> Generator[None]:
-        self.writer.begin(self.folder, [view for view in views if view.name not in self.done])
-        try:
-            yield
-        finally:
-            self.writer.end()
+    def lacks(self, view: View) -> bool:
+        """Whether the view is to be written now."""
+        return view.name not in self.done
 
-    def write(self, view: View) -> None:
-        if view.name not in self.done:
-            self.masks += self.writer.write(self.folder, view)
+    def write(self, view: View, answers: Iterator[Answer]) -> None:
+        if self.lacks(view):
+            self.masks += self.writer.write(self.folder, view, answers)
 
     def finish(self) -> None:
         self.writer.finish(self.folder)
         _write_header(self.folder, self.writer, {**self.metadata, "complete": True})
 
-    def seen(self, model: str, seconds: float) -> DescribedEvidence:
+    def seen(self, model: str, seconds: float, *, drawn: int) -> DescribedEvidence:
         files = (path for path in self.target.rglob("*") if path.is_file())
         return DescribedEvidence(
             folder=self.target,
@@ -293,6 +323,7 @@ class _Target:
             views=self.wanted,
             kept=len(self.done),
             masks=self.masks if self.writer.kind == "masks" else None,
+            drawn=drawn,
             seconds=seconds,
             bytes=sum(path.stat().st_size for path in files),
             notes=self.writer.notes(),

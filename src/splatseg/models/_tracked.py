@@ -6,7 +6,7 @@ what it saw, so the work cannot be taken up in the middle: all of it is written,
 
 import hashlib
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
@@ -23,9 +23,10 @@ from splatseg.io.evidence import (
     PanopticEvidence,
     TrackedEvidence,
     save_label_map,
+    save_render,
     save_tracks,
 )
-from splatseg.models._written import EvidenceWriter, Pictures, check_output, some
+from splatseg.models._written import Answer, EvidenceWriter, Look, check_output, some
 from splatseg.models.recorded import check_size
 
 _NUMBER = re.compile(r"(\d+)")
@@ -241,7 +242,7 @@ class TrackingEvidence(EvidenceWriter):
         *,
         seeds: Evidence | None,
         options: TrackingOptions,
-        pictures: Pictures,
+        image_of: Callable[[View], Image] | None,
     ) -> None:
         if seeds is None:
             raise InputError(
@@ -252,7 +253,7 @@ class TrackingEvidence(EvidenceWriter):
         self._seeds = Seeds(evidence=seeds, options=options)
         self._path = path = ordered_views(views, options.view_order)
         self._seeded = _seeded(self._seeds, path, options.seed_every)
-        self._pictures = pictures
+        self._look = Look(model=model, what=("tracked",), image_of=image_of)
         first = next(i for i, view in enumerate(path) if view.name in self._seeded)
         self._forward, self._backward = path[first:], path[:first][::-1]
         self._maps: Iterator[tuple[str, LabelMap]] | None = None
@@ -271,7 +272,7 @@ class TrackingEvidence(EvidenceWriter):
         }
 
     @override
-    def write(self, folder: Path, view: View) -> int:
+    def write(self, folder: Path, view: View, answers: Iterator[Answer]) -> int:
         if self._maps is None:
             self._maps = self._all(folder)
         ids = self._next(self._maps, view)
@@ -310,9 +311,16 @@ class TrackingEvidence(EvidenceWriter):
             _ = self._next(answers, first)
             yield from answers
 
+    def _picture(self, view: View, folder: Path) -> Image:
+        """What the tracker sees of a view; a render is kept beside the evidence."""
+        image = self._look.picture(view)
+        if view.image is None:
+            save_render(image, folder, view.name)
+        return image
+
     def _frames(self, views: Sequence[View], folder: Path) -> Iterator[tuple[str, Image]]:
         for view in views:
-            yield view.name, self._pictures.of(view, folder)
+            yield view.name, self._picture(view, folder)
 
     def _from_first_on(self, folder: Path) -> Iterator[tuple[str, LabelMap]]:
         seeds: dict[str, LabelMap] = {}
@@ -324,7 +332,7 @@ class TrackingEvidence(EvidenceWriter):
             nonlocal following
             for view in self._forward:
                 seeds.clear()
-                image = self._pictures.of(view, folder)
+                image = self._picture(view, folder)
                 if view.name in self._seeded:
                     seed = self._seeds.label_map(view)
                     if view.name in compared:

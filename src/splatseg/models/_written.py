@@ -3,8 +3,8 @@
 import shutil
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar
@@ -33,7 +33,6 @@ from splatseg.core.models import (
     TextFeatures,
     TextFeaturesWithWords,
 )
-from splatseg.core.threads import in_threads
 from splatseg.errors import InputError, ShapeError
 from splatseg.io.annotations import AREA_KINDS, AnnotationEvidence
 from splatseg.io.atomic import atomic_file, path_inside
@@ -51,6 +50,7 @@ from splatseg.io.evidence import (
     save_features,
     save_label_map,
     save_masks,
+    save_render,
     save_segments,
     save_text_embeddings,
     save_tracks,
@@ -110,17 +110,16 @@ class EvidenceWriter(ABC):
     reads: Path | None = None
     """Folder of evidence that is read, which is not to be written to."""
 
-    def begin(self, folder: Path, views: Sequence[View]) -> None:
-        """These views will be written next, in this order."""
-        return
-
-    def end(self) -> None:
-        """No view is written any more, perhaps of an error."""
-        return
-
     @abstractmethod
-    def write(self, folder: Path, view: View) -> int:
-        """Write one view; gives the number of masks, 0 for other kinds."""
+    def write(self, folder: Path, view: View, answers: Iterator["Answer"]) -> int:
+        """Write one view; gives the number of masks, 0 for other kinds.
+
+        Args:
+            folder: Where.
+            view: The view.
+            answers: What a model says, of which that of this view comes next; other evidence
+                leaves them.
+        """
 
     def start(self, folder: Path, views: Sequence[View]) -> None:
         """Write what all views share."""
@@ -150,34 +149,6 @@ def some(names: Sequence[str]) -> str:
     return ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
 
 
-class Pictures:
-    """Pictures of the views that are being looked at, so that several kinds read each once.
-
-    Args:
-        image_of: Gives the picture of a view, and may keep it in the folder that evidence is
-            written to; None takes photographs.
-    """
-
-    def __init__(self, image_of: Callable[[View, Path], Image] | None) -> None:
-        self._image_of = image_of
-        self._kept: dict[tuple[str, Path | None], Image] = {}
-
-    def of(self, view: View, folder: Path) -> Image:
-        """The picture of a view, for evidence that is written to a folder."""
-        # What is drawn is kept beside each kind; a photograph is the same for all.
-        key = (view.name, folder if view.image is None else None)
-        # Another thread may forget them in between.
-        picture = self._kept.get(key)
-        if picture is None:
-            picture = load_image(view) if self._image_of is None else self._image_of(view, folder)
-            self._kept[key] = picture
-        return picture
-
-    def forget(self) -> None:
-        """Let go of the pictures: other views come."""
-        self._kept.clear()
-
-
 def ability(model: Model, what: str | None) -> str:
     """What a model is asked for; None takes the most telling that it can be.
 
@@ -202,26 +173,70 @@ def batch_of(model: Model) -> int:
     return max(1, model.batch_size) if isinstance(model, BatchedModel) else 1
 
 
-def announce(
-    model: Model, targets: Iterable[tuple[EvidenceWriter, Path]], views: Sequence[View]
-) -> None:
-    """Let a model that takes several images at once see those of the next views.
+def threads_for(model: Model, what: Sequence[str], views: int) -> int:
+    """How many views are looked at at once in this process, each in a thread."""
+    concurrent = isinstance(model, ConcurrentMasks) and model.concurrent
+    return min(_native.threads(), views) if concurrent and tuple(what) == ("masks",) else 1
 
-    Images of one size go together.
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Look:
+    """A model, and what it is asked and shown."""
+
+    model: Any
+    what: tuple[str, ...]
+    image_of: Callable[[View], Image] | None = None
+    """Gives the picture of a view; None takes photographs."""
+
+    depth_of: Callable[[View], Float[Tensor, "height width"]] | None = None
+    """Gives the depth of a view to a model whose masks go by it."""
+
+    def picture(self, view: View) -> Image:
+        """What the model is shown of a view."""
+        with _ONE_VIEW:
+            return load_image(view) if self.image_of is None else self.image_of(view)
+
+    def answer(self, view: View, what: str, image: Image) -> Any:
+        """What the model says of a view."""
+        if what == "masks" and self.depth_of is not None:
+            with _ONE_VIEW:
+                depth = self.depth_of(view)
+            return self.model.masks_with_depth(image, depth, view.camera.fx)
+        return getattr(self.model, _QUESTIONS[what][2])(image)
+
+
+_ONE_VIEW = threading.Lock()
+"""Pictures and depths are read and drawn by one thread of a process at a time."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Answer:
+    """What a model says of a view to one question."""
+
+    found: Any
+    drawn: Image | None
+    """The picture that it was shown, where the view has no photograph."""
+
+
+def answers_of(look: Look, together: Sequence[tuple[View, Sequence[int]]]) -> Iterator[Answer]:
+    """Answers to the questions of views that a model looks at together, in their order.
+
+    A model that takes several images at once sees those of one size together.
 
     Args:
-        model: The model.
-        targets: What is asked of it, and the folder that each is written to.
-        views: The next views.
+        look: The model.
+        together: Views, and the places in `Look.what` of what is asked of each.
     """
-    if not isinstance(model, BatchedModel) or len(views) < 2:
-        return
-    images: list[Image] = []
-    for writer, folder in targets:
-        if isinstance(writer, ComputedEvidence):
-            images = [writer.pictures.of(view, folder) for view in views]
-    if len({tuple(image.shape) for image in images}) == 1:
-        model.encode(images)
+    images: dict[str, Image] = {}
+    if isinstance(look.model, BatchedModel) and len(together) > 1:
+        images = {view.name: look.picture(view) for view, _ in together}
+        if len({tuple(image.shape) for image in images.values()}) == 1:
+            look.model.encode(list(images.values()))
+    for view, questions in together:
+        image = images[view.name] if view.name in images else look.picture(view)
+        drawn = image if view.image is None else None
+        for question in questions:
+            yield Answer(found=look.answer(view, look.what[question], image), drawn=drawn)
 
 
 class ComputedEvidence(EvidenceWriter):
@@ -235,8 +250,7 @@ class ComputedEvidence(EvidenceWriter):
         views: Sequence[View],
         what: str | None,
         *,
-        pictures: Pictures,
-        depth_of: Callable[[View], Float[Tensor, "height width"]] | None = None,
+        with_depth: bool = False,
     ) -> None:
         self.views = views
         self.details = {}
@@ -245,16 +259,10 @@ class ComputedEvidence(EvidenceWriter):
         if self.what in ("labels", "panoptic"):
             self.classes = model.classes if self.what == "labels" else model.categories
         self._model = model
-        self.pictures = pictures
-        self._depth_of = depth_of if self.what == "masks" else None
-        if self._depth_of is not None:
+        if with_depth and self.what == "masks":
             self.settings = {"depth_from_scene": True}
         self._counts: dict[str, int] = {}
         """Masks by view, for the notes."""
-        self._ahead: Generator[Any] | None = None
-        """Masks of the next views, which other threads find."""
-        self._one_view = threading.Lock()
-        """Pictures and depths are read and drawn by one thread at a time."""
 
     @override
     def start(self, folder: Path, views: Sequence[View]) -> None:
@@ -264,29 +272,11 @@ class ComputedEvidence(EvidenceWriter):
             save_text_embeddings(word_vectors(self._model), folder)
 
     @override
-    def begin(self, folder: Path, views: Sequence[View]) -> None:
-        concurrent = isinstance(self._model, ConcurrentMasks) and self._model.concurrent
-        if self.what == "masks" and concurrent and len(views) > 1:
-            threads = min(_native.threads(), len(views))
-            self._ahead = in_threads(partial(self._found, folder), views, threads)
-
-    @override
-    def end(self) -> None:
-        if self._ahead is not None:
-            self._ahead.close()
-
-    def _found(self, folder: Path, view: View) -> Any:
-        """What the model says of a view."""
-        with self._one_view:
-            image = self.pictures.of(view, folder)
-            depth = None if self._depth_of is None else self._depth_of(view)
-        if depth is not None:
-            return self._model.masks_with_depth(image, depth, view.camera.fx)
-        return getattr(self._model, _QUESTIONS[self.what][2])(image)
-
-    @override
-    def write(self, folder: Path, view: View) -> int:
-        found = self._found(folder, view) if self._ahead is None else next(self._ahead)
+    def write(self, folder: Path, view: View, answers: Iterator[Answer]) -> int:
+        answer = next(answers)
+        found = answer.found
+        if answer.drawn is not None:
+            save_render(answer.drawn, folder, view.name)
         maps: Sequence[Any] = (found,)
         if isinstance(found, DeepFeatures | Panoptic):
             maps = found.maps if isinstance(found, DeepFeatures) else (found.ids,)
@@ -419,7 +409,7 @@ class CopiedEvidence(EvidenceWriter):
                 _copy(words if words.is_file() else beside, path_inside(folder, TEXT_FILE))
 
     @override
-    def write(self, folder: Path, view: View) -> int:
+    def write(self, folder: Path, view: View, answers: Iterator[Answer]) -> int:
         name, size = view.name, (view.camera.height, view.camera.width)
         evidence = self._evidence
         if evidence.kind == "masks":

@@ -11,6 +11,8 @@ from .edit import edit_scene as edit_scene
 from .edit_operations import EditOptions as EditOptions
 from .evaluate import EvaluationOptions as EvaluationOptions
 from .evaluate import evaluate_scene as evaluate_scene
+from .executors import ExecutorOptions as ExecutorOptions
+from .executors import open_executor as open_executor
 from .export import Exported as Exported
 from .export import check_layer_exports as check_layer_exports
 from .export import export_layer as export_layer

@@ -3,8 +3,8 @@
 import math
 import re
 import shutil
-from collections.abc import Generator, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Generator, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,9 +16,11 @@ from PIL import Image
 from torch import Tensor
 
 from splatseg.core import (
+    LOCAL,
     UNLABELLED,
     Capture,
     ClassTable,
+    Executor,
     LabelledMesh,
     LabelledPoints,
     Layer,
@@ -186,6 +188,7 @@ def render_views(
     layers: Mapping[str, Layer] | None = None,
     field: Renderable | None = None,
     backend: BackendName = "auto",
+    executor: Executor = LOCAL,
     observer: Observer = SILENT,
 ) -> Rendering:
     """Draw views of a scene into OUTPUT/<what>/<view>.png, in the photographs' own pixels.
@@ -200,6 +203,7 @@ def render_views(
         field: What is rendered, with layers of its own; None is the scene's Gaussians with
             theirs.
         backend: Rendering backend of the Gaussians.
+        executor: Where views are drawn and their files written; films are made here.
         observer: Is told of the progress.
 
     Raises:
@@ -225,7 +229,10 @@ def render_views(
     record = _check_output(output, folders, files)
     output.mkdir(parents=True, exist_ok=True)
     try:
-        _render(scene, field, views, drawn, output, folders=folders, observer=observer)
+        _render(
+            scene, field, views, drawn, output,
+            folders=folders, executor=executor, observer=observer,
+        )  # fmt: skip
         # Before the films, which take a while: what an interruption leaves can be replaced.
         entry = {
             "scene": str(scene.root or scene.source),
@@ -259,6 +266,7 @@ def _render(
     output: Path,
     *,
     folders: Sequence[str],
+    executor: Executor = LOCAL,
     observer: Observer,
 ) -> None:
     """Draw everything; each folder appears whole at the end or not at all."""
@@ -266,19 +274,40 @@ def _render(
         into = {
             name: stack.enter_context(atomic_folder(path_inside(output, name))) for name in folders
         }
-        with observer.stage("render") as step:
-            for done, view in enumerate(views, start=1):
-                with field.view(view.camera) as looked_at:
-                    _draw_pictures(looked_at, view, into)
-                    for layer in layers:
-                        _draw_layer(looked_at, view, layer, into)
+        drawing = _Drawing(field=field, layers=layers, into=into)
+        with (
+            observer.stage("render") as step,
+            closing(executor.map(_draw_view, views, shared=drawing)) as drawn,
+        ):
+            for done, _ in enumerate(drawn, start=1):
                 step(done, len(views))
+        for folder in into.values():
+            sweep(folder)  # what a worker that died was writing
         if "depth" in into:
             _finish_depth(into["depth"], views, scene)
         for layer in layers:
             if not layer.is_selection:
                 legend = legend_of(layer.summary, scene.classes, colours=layer.colours)
                 write_json(legend, into[layer.name] / "legend.json")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Drawing:
+    """What is drawn of all views."""
+
+    field: Renderable
+    layers: Sequence[_Layer]
+    into: Mapping[str, Path]
+    """Folders by what goes there."""
+
+
+def _draw_view(drawing: _Drawing, view: View) -> Iterator[str]:
+    """Write the files of a view; gives its name."""
+    with drawing.field.view(view.camera) as looked_at:
+        _draw_pictures(looked_at, view, drawing.into)
+        for layer in drawing.layers:
+            _draw_layer(looked_at, view, layer, drawing.into)
+    yield view.name
 
 
 def _folders(wanted: Sequence[str], coloured: Sequence[str]) -> list[str]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import field, replace
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -9,7 +10,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from splatseg.core import Model, PromptableMasks, Renderable, Scene, View
+from splatseg.core import LOCAL, Executor, Model, PromptableMasks, Renderable, Scene, View
 from splatseg.core.boundary import boundary
 from splatseg.core.models import DepthAwareMasks, Image
 from splatseg.core.options import options
@@ -20,7 +21,6 @@ from splatseg.io.evidence import (
     EvidenceKind,
     evidence_names,
     find_evidence,
-    save_render,
 )
 from splatseg.io.images import image_camera, load_image
 from splatseg.io.scene import check_name
@@ -108,6 +108,7 @@ def see(
     model_options: object = None,
     loading: LoadOptions | None = None,
     backend: BackendName = "auto",
+    executor: Executor = LOCAL,
     observer: Observer = SILENT,
 ) -> DescribedEvidence:
     """Write what a model sees in views to SCENE/evidence/NAME, a file a view.
@@ -127,6 +128,7 @@ def see(
             defaults.
         loading: The model's weights, and where and how it runs.
         backend: Rendering backend, for views without photographs.
+        executor: Where the model looks at views; each process has the model once.
         observer: Is told of the progress.
 
     Raises:
@@ -148,7 +150,6 @@ def see(
     if found.note:
         observer.note(f"{found.name}: {found.note}")
     folder = scene_path(root, EVIDENCE_FOLDER, evidence)
-    images = ViewImages(work)
     takes_depth = options.depth_from_scene and isinstance(found, DepthAwareMasks)
     depth_of = scene_depth(work) if takes_depth else None
     with work_on_scene(root, "see"), observer.stage("see") as step:
@@ -163,16 +164,17 @@ def see(
                 allow_missing=options.allow_missing,
                 seeds=seeds,
                 tracking=tracking,
-                image_of=images,
+                image_of=ViewImages(work),
                 depth_of=depth_of,
             ),
+            executor=executor,
             progress=step,
         )
-    if images.drawn:
+    if seen.drawn:
         was = "view that has no photograph was"
         were = "views that have no photograph were"
         note = (
-            f"{images.drawn} {was if images.drawn == 1 else were} rendered for the model; the "
+            f"{seen.drawn} {was if seen.drawn == 1 else were} rendered for the model; the "
             f"renders are in {folder / RENDERS_FOLDER}."
         )
         seen = replace(seen, notes=(*seen.notes, note))
@@ -183,15 +185,14 @@ def see(
 
 def scene_depth(work: Work) -> Callable[[View], Float[Tensor, "height width"]]:
     """Depth of views as the scene's Gaussians have it; 0 where little of them is in front."""
-    field = work.field()
+    return partial(_depth_of, work.field())
 
-    def depth(view: View) -> Float[Tensor, "height width"]:
-        with field.view(view.camera) as prepared:
-            signals = prepared.signals(colour=False)
-        # NaN is what the renderer could not tell.
-        return torch.where(signals.alpha > _SEEN_THROUGH, signals.depth, 0).nan_to_num(0.0)
 
-    return depth
+def _depth_of(field: Renderable, view: View) -> Float[Tensor, "height width"]:
+    with field.view(view.camera) as prepared:
+        signals = prepared.signals(colour=False)
+    # NaN is what the renderer could not tell.
+    return torch.where(signals.alpha > _SEEN_THROUGH, signals.depth, 0).nan_to_num(0.0)
 
 
 def _model(
@@ -371,7 +372,7 @@ _SMALL = 128
 
 
 class ViewImages:
-    """Gives the picture of a view, and keeps those that it drew beside the evidence.
+    """Gives the picture of a view.
 
     Models see images only; that some of them are renders is this task's business. What nothing
     covers is of the grey (black, white, half) that the scene itself has least of, so that a dark
@@ -385,15 +386,12 @@ class ViewImages:
         self._field = work.field()
         self._views = tuple(view for view in work.scene.views if view.image is None)
         self._background: float | None = None
-        self.drawn = 0
-        """Views drawn so far."""
 
-    def __call__(self, view: View, folder: Path) -> Image:
+    def __call__(self, view: View) -> Image:
         """The photograph of a view, uint8 (H, W, 3); its render where it has none.
 
         Args:
             view: The view.
-            folder: The evidence as it is being written; renders are kept in its ``_renders``.
 
         Raises:
             MissingFileError: If the view has a photograph that is not where it was.
@@ -405,10 +403,7 @@ class ViewImages:
             self._background = background_of(self._field, self._views)
         colour, alpha = _drawn_view(self._field, view)
         over = (colour + (1 - alpha)[..., None] * self._background).clamp(0, 1)
-        image = (over * 255 + 0.5).to(torch.uint8)
-        save_render(image, folder, view.name)
-        self.drawn += 1
-        return image
+        return (over * 255 + 0.5).to(torch.uint8)
 
 
 def shown_image(view: View, prepared: PreparedView) -> UInt8[Tensor, "height width 3"]:

@@ -7,8 +7,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from splatseg.core import (
+    LOCAL,
     UNLABELLED,
     ClassTable,
+    Executor,
     InstanceTree,
     Labels,
     Layer,
@@ -148,6 +150,7 @@ def segment(
     checkpoints: CheckpointOptions | None = None,
     layers: Mapping[str, Layer] | None = None,
     backend: BackendName = "auto",
+    executor: Executor = LOCAL,
     observer: Observer = SILENT,
 ) -> Segmentation:
     """Lift what was seen in photographs onto the Gaussians, as well as the method knows how.
@@ -165,6 +168,7 @@ def segment(
             whether it goes on from there. What ends it early leaves a checkpoint; None keeps none.
         layers: Layers at hand; others are read from the scene's folder.
         backend: Rendering backend.
+        executor: Where views are worked on; the layer does not depend on it.
         observer: Is told of the progress.
 
     Raises:
@@ -172,7 +176,7 @@ def segment(
         ShapeError: If evidence does not have its photograph's proportions.
         KeyboardInterrupt: If it was interrupted; the message says how to go on.
     """
-    work = Work(scene=scene, layers=layers, backend=backend, observer=observer)
+    work = Work(scene=scene, layers=layers, backend=backend, observer=observer, executor=executor)
     method = find_method(method) if isinstance(method, str) else method
     return segment_work(
         work,
@@ -225,6 +229,7 @@ def segment_work(
         metres_per_unit=scene.metres_per_unit,
         up=scene.up,
         backend=work.backend,
+        executor=work.executor,
         seed=options.seed,
         checkpoints=training_checkpoints(work, layer_name, method, checkpoints)
         if keeps_state

@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Any, Protocol
 import torch
 
 from splatseg.core import (
+    LOCAL,
     Capture,
+    Executor,
     Features,
     FlatLayer,
     Gaussians,
@@ -128,6 +130,7 @@ class Work:
 
     backend: BackendName = "auto"
     observer: Observer = SILENT
+    executor: Executor = LOCAL
     _facts: dict[str, LayerFacts] = field(default_factory=dict[str, LayerFacts])
     _evidence: dict[str, Evidence] = field(default_factory=dict[str, Evidence])
 

@@ -10,15 +10,18 @@ References:
     scenes (2024), eq. 4.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
+from dataclasses import asdict, dataclass
 
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
 from splatseg.core import (
+    LOCAL,
     Camera,
+    Executor,
     FeatureMap,
     Features,
     FeatureSource,
@@ -59,6 +62,7 @@ def uplift_features(
     *,
     options: FeatureUpliftOptions | None = None,
     backend: str = "auto",
+    executor: Executor = LOCAL,
     progress: Callable[[int, int], None] | None = None,
 ) -> Features:
     """Give Gaussians the mean of the features that their pixels have.
@@ -73,6 +77,7 @@ def uplift_features(
             in proportion. A last row or column of cells may reach over the edge, or be missing.
         options: How features are normalised and read.
         backend: Name of the rendering backend.
+        executor: Where the views are worked on; the layer does not depend on it.
         progress: Called with the views done and all there are.
 
     Returns:
@@ -90,7 +95,8 @@ def uplift_features(
         options=options_for(gaussians, backend),
         backend=backend,
     )
-    values, weights = _weighted_sums(adjoint, ordered, evidence, options, progress)
+    lifting = _Lifting(adjoint=adjoint, evidence=evidence, options=options)
+    values, weights = _weighted_sums(lifting, ordered, executor, progress)
     seen = weights > 0
     values /= torch.where(seen, weights, 1.0).unsqueeze(1)
     values[~seen] = 0
@@ -105,43 +111,73 @@ def uplift_features(
     )
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Lifting:
+    """What features of all views are lifted with."""
+
+    adjoint: RenderAdjoint
+    evidence: FeatureSource
+    options: FeatureUpliftOptions
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Sums:
+    """Some channels of a view's features, summed on the Gaussians that it shows."""
+
+    channels: slice
+    width: int
+    """Channels of the view's features."""
+
+    gaussians: Int64[Tensor, "m"]
+    """Those it shows."""
+
+    values: Float[Tensor, "m some"]
+    weights: Float[Tensor, "m"]
+    """How much of each the view shows."""
+
+    @property
+    def is_last(self) -> bool:
+        return self.channels.stop >= self.width
+
+
 def _weighted_sums(
-    adjoint: RenderAdjoint,
+    lifting: _Lifting,
     ordered: Sequence[View],
-    evidence: FeatureSource,
-    options: FeatureUpliftOptions,
+    executor: Executor,
     progress: Callable[[int, int], None] | None,
 ) -> tuple[Tensor, Tensor]:
     """Features (n, channels) summed with blending weights over all views, and the weights (n,)."""
-    count = len(adjoint.gaussians)
+    count = len(lifting.adjoint.gaussians)
     weights = torch.zeros(count)
     values: Tensor | None = None
-    for done, view in enumerate(ordered):
-        grid = checked_grid(view, evidence.features(view.name))
-        if values is None:
-            values = torch.zeros(count, grid.channels)
-        if grid.channels != values.shape[1]:
-            raise ShapeError(
-                f"evidence: expected {values.shape[1]} channels of view {view.name}, as of view "
-                f"{ordered[0].name}, got {grid.channels}."
-            )
-        weights += _add_view(adjoint, view, grid, options, values)
-        if progress is not None:
-            progress(done + 1, len(ordered))
+    done = 0
+    with closing(executor.map(_view_sums, ordered, shared=lifting)) as found:
+        for sums in found:
+            if values is None:
+                values = torch.zeros(count, sums.width)
+            if sums.width != values.shape[1]:
+                raise ShapeError(
+                    f"evidence: expected {values.shape[1]} channels of view {ordered[done].name}, "
+                    f"as of view {ordered[0].name}, got {sums.width}."
+                )
+            # What the view does not show gets nothing from it, which leaves its bits.
+            values[:, sums.channels].index_put_((sums.gaussians,), sums.values, accumulate=True)
+            if not sums.is_last:
+                continue
+            weights[sums.gaussians] += sums.weights
+            done += 1
+            if progress is not None:
+                progress(done, len(ordered))
     if values is None:
         raise InputError("views: expected at least one view with features, got none.")
     return values, weights
 
 
-def _add_view(
-    adjoint: RenderAdjoint,
-    view: View,
-    grid: FeatureMap,
-    options: FeatureUpliftOptions,
-    values: Tensor,
-) -> Tensor:
-    """Add a view's weighted features to `values`, some channels at a time; gives its weights."""
+def _view_sums(lifting: _Lifting, view: View) -> Iterator[_Sums]:
+    """A view's weighted features, some channels at a time."""
+    grid = checked_grid(view, lifting.evidence.features(view.name))
     covered, camera = camera_of_grid(view, grid)
+    options, adjoint = lifting.options, lifting.adjoint
     if options.longest_side is not None:
         longest = max(camera.width, camera.height)
         if longest > options.longest_side:
@@ -150,7 +186,6 @@ def _add_view(
                 max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
             )
     features = grid.features.float().cpu()
-    weights = torch.zeros(len(values))
     with adjoint.prepared(camera) as prepared:
         for start in range(0, grid.channels, _CHANNELS):
             part = slice(start, start + _CHANNELS)
@@ -160,8 +195,14 @@ def _add_view(
                 size=(camera.height, camera.width),
             )
             sums, weights = adjoint.back_project(prepared, image)
-            values[:, part] += sums
-    return weights
+            shown = torch.nonzero(weights > 0).squeeze(1)
+            yield _Sums(
+                channels=part,
+                width=grid.channels,
+                gaussians=shown,
+                values=sums[shown],
+                weights=weights[shown],
+            )
 
 
 def read_grid(

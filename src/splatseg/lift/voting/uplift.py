@@ -18,7 +18,8 @@ References:
     scenes (2024), eq. 4: the same normalised adjoint, for features.
 """
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from itertools import pairwise
 from typing import Annotated
@@ -29,9 +30,11 @@ from msgspec import Meta
 from torch import Tensor
 
 from splatseg.core import (
+    LOCAL,
     UNLABELLED,
     Camera,
     ClassTable,
+    Executor,
     Gaussians,
     LabelMap,
     Labels,
@@ -46,7 +49,14 @@ from splatseg.core.options import Count, NonNegative, Share, options
 from splatseg.errors import InputError
 from splatseg.lift.voting.confusion import ViewVotes
 from splatseg.lift.voting.votes import SLOTS, LabelRule, Ranking, VoteTable, decide
-from splatseg.render import PreparedView, RenderOptions, SparseImage, options_for, prepare
+from splatseg.render import (
+    PreparedView,
+    RenderOptions,
+    SparseBackProjected,
+    SparseImage,
+    options_for,
+    prepare,
+)
 
 
 def voting_views(views: Sequence[View], evidence: ViewNames, what: str) -> list[View]:
@@ -122,16 +132,9 @@ class RenderAdjoint:
     gaussians: Gaussians
     options: RenderOptions
     backend: str
-    by_view: ViewVotes | None = None
-    """Where a sample of the votes is kept view by view."""
 
-    def add_view(
-        self, table: VoteTable, label_mass: LabelMass, camera: Camera, label_map: LabelMap
-    ) -> Tensor:
-        """Add a view's votes; returns how much of each Gaussian the view shows, (n,).
-
-        One pass over the view, whatever the number of ids.
-        """
+    def votes(self, camera: Camera, label_map: LabelMap) -> "LabelVotes":
+        """A view's votes for the ids of its map, in one pass whatever their number."""
         ids, index, votes = pixel_votes(label_map)
         index = index.reshape(-1)
         labelled = index >= 0
@@ -145,15 +148,7 @@ class RenderAdjoint:
             count=len(ids),
         )
         with torch.no_grad(), self.prepared(camera) as view:
-            projected = view.back_project_sparse(image)
-        for votes_of in (table, self.by_view):
-            if votes_of is not None:
-                votes_of.add_sparse(ids[projected.channels], projected.gaussians, projected.sums)
-        on_gaussians = torch.bincount(
-            projected.channels, weights=projected.sums.double(), minlength=len(ids)
-        )
-        label_mass.add(ids.tolist(), votes, on_gaussians)
-        return projected.weights
+            return LabelVotes(ids=ids, pixels=votes, projected=view.back_project_sparse(image))
 
     def prepared(self, camera: Camera) -> PreparedView:
         """A view, to be used more than once."""
@@ -166,6 +161,50 @@ class RenderAdjoint:
         with torch.no_grad():
             projected = view.back_project(image.to(self.gaussians.means), warp="nearest")
         return projected.sums.float().cpu(), projected.weights.float().cpu()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LabelVotes:
+    """What one view says."""
+
+    ids: Int64[Tensor, "ids"]
+    """Of its label map, ascending."""
+
+    pixels: Float[Tensor, "ids"]
+    """Pixels of each, or their confidences, summed; float64."""
+
+    projected: SparseBackProjected
+    """Votes of each id, a channel, on Gaussians; and how much of each Gaussian the view shows."""
+
+    def add_to(
+        self, table: VoteTable, label_mass: LabelMass, by_view: ViewVotes | None = None
+    ) -> None:
+        """Add them to those of other views; `by_view` keeps a sample of them view by view."""
+        projected = self.projected
+        for votes_of in (table, by_view):
+            if votes_of is not None:
+                votes_of.add_sparse(
+                    self.ids[projected.channels], projected.gaussians, projected.sums
+                )
+        on_gaussians = torch.bincount(
+            projected.channels, weights=projected.sums.double(), minlength=len(self.ids)
+        )
+        label_mass.add(self.ids.tolist(), self.pixels, on_gaussians)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Voting:
+    """What votes of all views need."""
+
+    adjoint: RenderAdjoint
+    evidence: LabelSource
+
+
+def _votes_of(voting: _Voting, view: View) -> Iterator[LabelVotes]:
+    """The votes of a view."""
+    label_map = voting.evidence.label_map(view.name)
+    camera = camera_of_map(view, label_map.height, label_map.width)
+    yield voting.adjoint.votes(camera, label_map)
 
 
 @options(
@@ -220,6 +259,7 @@ def uplift(
     options: UpliftOptions | None = None,
     classes: ClassTable | None = None,
     backend: str = "auto",
+    executor: Executor = LOCAL,
     progress: Callable[[int, int], None] | None = None,
 ) -> Labels:
     """Label Gaussians by the votes of label maps.
@@ -237,6 +277,7 @@ def uplift(
         options: How votes become labels.
         classes: Names of the ids, for the info.
         backend: Name of the rendering backend.
+        executor: Where the views are worked on; the layer does not depend on it.
         progress: Called with the views done and all there are to do.
 
     Returns:
@@ -257,22 +298,21 @@ def uplift(
         gaussians=gaussians,
         options=options_for(gaussians, backend),
         backend=backend,
-        by_view=by_view,
     )
     slots = max(SLOTS, options.candidates)
     table = VoteTable(len(gaussians), memory=options.memory, slots=slots)
     label_mass = LabelMass()
     visibility, squares = torch.zeros(len(gaussians)), torch.zeros(len(gaussians))
-    for done, view in enumerate(ordered):
-        label_map = evidence.label_map(view.name)
-        camera = camera_of_map(view, label_map.height, label_map.width)
-        view_visibility = adjoint.add_view(table, label_mass, camera, label_map)
-        visibility += view_visibility
-        squares += view_visibility**2
-        if by_view is not None:
-            by_view.end_view(view.camera)
-        if progress is not None:
-            progress(done + 1, len(ordered))
+    voting = _Voting(adjoint=adjoint, evidence=evidence)
+    with closing(executor.map(_votes_of, ordered, shared=voting)) as found:
+        for done, (view, votes) in enumerate(zip(ordered, found, strict=True)):
+            votes.add_to(table, label_mass, by_view)
+            visibility += votes.projected.weights
+            squares += votes.projected.weights**2
+            if by_view is not None:
+                by_view.end_view(view.camera)
+            if progress is not None:
+                progress(done + 1, len(ordered))
     if not label_mass.total:
         raise InputError(
             f"evidence: expected a labelled pixel in {len(ordered)} views, found none."

@@ -26,8 +26,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatseg.core import (
+    LOCAL,
     UNLABELLED,
     ClassTable,
+    Executor,
     Gaussians,
     InstanceFacts,
     InstanceTree,
@@ -109,6 +111,7 @@ def associate(
     sharpen_votes: bool = True,
     classes: ClassTable | None = None,
     backend: str = "auto",
+    executor: Executor = LOCAL,
     progress: Callable[[int, int], None] | None = None,
 ) -> Labels | InstanceTree:
     """Instances from segments of views.
@@ -125,6 +128,7 @@ def associate(
         sharpen_votes: Of a tree: solve for how much of each Gaussian belongs to which node.
         classes: Names of the categories of segments; instances are named after theirs.
         backend: Name of the rendering backend.
+        executor: Where masses of views are found; the result does not depend on it.
         progress: Called with the views done and their number.
 
     Returns:
@@ -148,6 +152,7 @@ def associate(
             sharpen_votes=sharpen_votes,
             classes=classes,
             backend=backend,
+            executor=executor,
             progress=progress,
         )
         return tree if options.level == "tree" else tree.cut(tree_level(options.level))
@@ -157,6 +162,7 @@ def associate(
         source,
         longest_side=options.longest_side,
         backend=backend,
+        executor=executor,
         progress=progress,
     )
     group = cluster(table.agreement(), options.agreement)
@@ -181,7 +187,12 @@ class AssociatedMasks:
 
 
 def associate_masks(
-    gaussians: Gaussians, views: Sequence[View], source: SegmentSource, *, backend: str = "auto"
+    gaussians: Gaussians,
+    views: Sequence[View],
+    source: SegmentSource,
+    *,
+    backend: str = "auto",
+    executor: Executor = LOCAL,
 ) -> AssociatedMasks:
     """The tree that `associate` makes of masks by default, and the node of each mask.
 
@@ -190,7 +201,7 @@ def associate_masks(
         ShapeError: If masks do not have their photograph's proportions.
     """
     tree, node, table = _associated_tree(
-        gaussians, views, source, AssociateOptions(), backend=backend
+        gaussians, views, source, AssociateOptions(), backend=backend, executor=executor
     )
     nodes: dict[str, NDArray[np.int64]] = {}
     for index, name in enumerate(table.views):
@@ -211,12 +222,19 @@ def _associated_tree(
     sharpen_votes: bool = True,
     classes: ClassTable | None = None,
     backend: str,
+    executor: Executor,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[InstanceTree, NDArray[np.int64], SegmentTable]:
     """Groups, objects and parts of masks, the node of each mask, and the table of masks."""
     side = options.longest_side
     table = segment_table(
-        gaussians, views, source, longest_side=side, backend=backend, progress=progress
+        gaussians,
+        views,
+        source,
+        longest_side=side,
+        backend=backend,
+        executor=executor,
+        progress=progress,
     )
     support, count = options.min_support, min(options.min_views, len(table.views))
     agreement = table.agreement()
@@ -232,7 +250,14 @@ def _associated_tree(
     votes = tree_votes(table, found, level, confusion=confusion)
     if sharpen_votes:
         votes = sharpened_votes(
-            gaussians, views, source, table, votes, longest_side=side, backend=backend
+            gaussians,
+            views,
+            source,
+            table,
+            votes,
+            longest_side=side,
+            backend=backend,
+            executor=executor,
         )
     votes = without_outside(votes, table, found, min_support=support)
     tree, node = instance_tree(table, found, level, votes, classes)
@@ -338,6 +363,7 @@ def run(inputs: MethodInputs, options: AssociateMethodOptions) -> Labels | Insta
         sharpen_votes=options.sharpen_votes,
         classes=inputs.categories,
         backend=inputs.backend,
+        executor=inputs.executor,
         progress=inputs.progress,
     )
 
@@ -358,6 +384,7 @@ def update(
             sharpen_votes=False,
             classes=inputs.categories,
             backend=inputs.backend,
+            executor=inputs.executor,
         )
 
     return with_views(
@@ -368,6 +395,7 @@ def update(
         associated=associated,
         longest_side=options.association.longest_side,
         backend=inputs.backend,
+        executor=inputs.executor,
         progress=inputs.progress,
     )
 

@@ -17,8 +17,9 @@ References:
     projections (1972): SIRT. Its convergence with these weights: Censor and Elfving (2002).
 """
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -29,8 +30,10 @@ from torch import Tensor
 
 from splatseg import _native
 from splatseg.core import (
+    LOCAL,
     UNLABELLED,
     Camera,
+    Executor,
     Gaussians,
     LabelMap,
     MaskSet,
@@ -196,6 +199,7 @@ def fit_memberships(
     start: Any,
     *,
     backend: str = "auto",
+    executor: Executor = LOCAL,
 ) -> Any:
     """Memberships of Gaussians in the ids of label maps, see `MembershipProblem`.
 
@@ -209,22 +213,41 @@ def fit_memberships(
         start: scipy rows (Gaussians, ids) of float32: what is known of each Gaussian before, such
             as its votes, in [0, 1]. Ids it does not have there, it cannot get.
         backend: Name of the rendering backend.
+        executor: Where rows of W are found; the memberships do not depend on it.
 
     Returns:
         scipy rows (Gaussians, ids) with the entries of `start`, values in [0, 1].
     """
-    drawn: list[tuple[Camera, NDArray[np.int64]]] = []
-    labels: list[NDArray[np.int32]] = []
-    for index, view in enumerate(views):
-        ids = label_map(view)
-        pixels = drawn_pixels(ids, _PIXELS, np.random.default_rng((0, index)))
-        drawn.append((camera_of_map(view, ids.height, ids.width), pixels))
-        labels.append(ids.ids.reshape(-1).numpy()[pixels])
-    rows = rows_of_pixels(gaussians, drawn, backend=backend)
-    problem = MembershipProblem(rows, start, np.concatenate(labels))
-    view_of = np.repeat(np.arange(len(views)), [len(pixels) for _, pixels in drawn])
+    drawing = _Drawing(gaussians=gaussians, label_map=label_map, backend=backend)
+    with closing(executor.map(_drawn_rows, enumerate(views), shared=drawing)) as found:
+        rows, labels = zip(*found, strict=True)
+    problem = MembershipProblem(
+        scipy.sparse.vstack(rows, format="csr", dtype=np.float32), start, np.concatenate(labels)
+    )
+    view_of = np.repeat(np.arange(len(views)), [len(of_view) for of_view in labels])
     problem.run(_agreeing(problem, view_of, start.shape[1]), _SOLVER_STEPS)
     return problem.memberships()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Drawing:
+    """What pixels of all views are drawn with."""
+
+    gaussians: Gaussians
+    label_map: Callable[[View], LabelMap]
+    backend: str
+
+
+def _drawn_rows(
+    drawing: _Drawing, item: tuple[int, View]
+) -> Iterator[tuple[Any, NDArray[np.int32]]]:
+    """Rows of W of the pixels drawn of a view, and their labels."""
+    index, view = item
+    ids = drawing.label_map(view)
+    pixels = drawn_pixels(ids, _PIXELS, np.random.default_rng((0, index)))
+    camera = camera_of_map(view, ids.height, ids.width)
+    rows = rows_of_pixels(drawing.gaussians, [(camera, pixels)], backend=drawing.backend)
+    yield rows, ids.ids.reshape(-1).numpy()[pixels]
 
 
 def _agreeing(
@@ -266,6 +289,7 @@ def sharpened_votes(
     *,
     longest_side: int,
     backend: str,
+    executor: Executor = LOCAL,
 ) -> TreeVotes:
     """The votes with memberships, and each Gaussian with the object it belongs to most.
 
@@ -277,6 +301,7 @@ def sharpened_votes(
         votes: What they say.
         longest_side: As `segment_table` had it.
         backend: Name of the rendering backend.
+        executor: Where rows of W are found.
     """
     decided = votes.objects.ids.numpy() - 1
     start = _start(votes.own, np.where(decided < 0, -1, decided))
@@ -288,6 +313,7 @@ def sharpened_votes(
         painted(table, votes.object_of_segment, source, longest_side),
         start,
         backend=backend,
+        executor=executor,
     )
     objects, shares = _strongest(found)
     best = objects[:, 0]
@@ -316,23 +342,41 @@ def painted(
         source: Where their pixels are.
         longest_side: Larger maps are reduced to it, in pixels.
     """
+    return _Painting(
+        rows={name: np.flatnonzero(table.view == index) for index, name in enumerate(table.views)},
+        name=table.name,
+        group=group,
+        source=source,
+        longest_side=longest_side,
+    )
 
-    def label_map(view: View) -> LabelMap:
-        segments = reduced_segments(source.segments_of(view.name), longest_side)
-        own = np.flatnonzero(table.view == table.views.index(view.name))
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Painting:
+    """See `painted`."""
+
+    rows: Mapping[str, NDArray[np.int64]]
+    """Rows of the segments of each view."""
+
+    name: NDArray[np.int64]
+    group: NDArray[np.int64]
+    source: SegmentSource
+    longest_side: int
+
+    def __call__(self, view: View) -> LabelMap:
+        segments = reduced_segments(self.source.segments_of(view.name), self.longest_side)
+        own, name, group = self.rows[view.name], self.name, self.group
         if isinstance(segments, MaskSet):
             ids = torch.full((segments.height, segments.width), UNLABELLED, dtype=torch.int32)
-            areas = np.array([segments.masks[int(table.name[s])].area for s in own])
+            areas = np.array([segments.masks[int(name[s])].area for s in own])
             for segment in own[np.argsort(-areas, kind="stable")].tolist():
                 if group[segment] >= 0:
-                    ids[segments.dense(int(table.name[segment]))] = int(group[segment])
+                    ids[segments.dense(int(name[segment]))] = int(group[segment])
             return LabelMap(ids=ids)
         names = segments.ids.numpy()
         table_of = np.full(int(names.max(initial=0)) + 2, UNLABELLED, np.int32)
-        table_of[table.name[own]] = group[own]
+        table_of[name[own]] = group[own]
         return LabelMap(ids=torch.from_numpy(table_of[names]))
-
-    return label_map
 
 
 def _start(votes: Any, decided: NDArray[np.int64]) -> Any:

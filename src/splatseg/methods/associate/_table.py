@@ -10,6 +10,7 @@ masks lie over its pixels.
 """
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -17,19 +18,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from splatseg.core import (
-    UNLABELLED,
-    Gaussians,
-    LabelMap,
-    MaskSet,
-    SegmentSource,
-    View,
-    camera_of_map,
-)
+from splatseg.core import LOCAL, Executor, Gaussians, SegmentSource, View
 from splatseg.errors import InputError
-from splatseg.lift.segments import reduced_segments
-from splatseg.lift.voting.segment_masses import ViewMasses, entries_of, sparse_product, view_masses
+from splatseg.lift.voting.segment_masses import entries_of, sparse_product
 from splatseg.methods.associate._clustering import Agreement, shared_masses
+from splatseg.methods.associate._view_entries import MIN_MASS, Collecting, view_entries
 
 MAX_VIEWS = 50
 """Views of each Gaussian that are compared, those that see most of it; bounds memory and time."""
@@ -187,9 +180,6 @@ _MIN_WEIGHT = 0.05
 _MIN_SHARE = 0.1
 """A segment that holds less than this share of what a view sees of a Gaussian only touches it."""
 
-_MIN_MASS = 1e-3
-
-
 _PAIRS = 4e9
 """Products of pairs of entries at most: about a minute. A sample of Gaussians does beyond it."""
 
@@ -336,7 +326,7 @@ class SegmentTable:
     def _shares(self, entries: slice) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
         """Which entries are more than a touch, and each one's share of what its view sees."""
         seen = self.seen[entries]
-        least = np.maximum(seen, _MIN_MASS)
+        least = np.maximum(seen, MIN_MASS)
         share: NDArray[np.float32] = np.divide(self.mass[entries], least, dtype=np.float32)
         return (seen > _MIN_WEIGHT) & (share > _MIN_SHARE), share
 
@@ -386,6 +376,7 @@ def segment_table(
     *,
     longest_side: int,
     backend: str = "auto",
+    executor: Executor = LOCAL,
     progress: Callable[[int, int], None] | None = None,
 ) -> SegmentTable:
     """Collect the segments of views.
@@ -397,6 +388,7 @@ def segment_table(
         longest_side: Larger segments are read at so many pixels along their longest side. Masses
             stay in pixels of the segments as they came.
         backend: Name of the rendering backend.
+        executor: Where the views are worked on; the table does not depend on it.
         progress: Called with the views done and their number.
 
     Raises:
@@ -411,28 +403,17 @@ def segment_table(
     entries = SegmentEntries(len(gaussians), MAX_VIEWS)
     rows: list[tuple[int, int, int, float, int, float]] = []
     covered, visible = np.zeros((2, len(gaussians)))
-    for place, view in enumerate(ordered):
-        segments = source.segments_of(view.name)
-        names, scores = _in_order(segments)
-        categories = source.categories_of(view.name)
-        camera_of_map(view, segments.height, segments.width)  # refuses other proportions
-        if isinstance(segments, LabelMap):
-            segments = LabelMap(ids=segments.ids)
-        worth = segments.height * segments.width
-        segments = reduced_segments(segments, longest_side)
-        worth /= segments.height * segments.width
-        camera = camera_of_map(view, segments.height, segments.width)
-        found = view_masses(gaussians, camera, segments, backend=backend)
-        rows += [
-            (place, name, categories.get(name, UNLABELLED), score, *_kind_of(segments, name))
-            for name, score in zip(names, scores, strict=True)
-        ]
-        outside = isinstance(segments, MaskSet)
-        _add(entries, found, names, worth, outside=outside)
-        covered += worth * found.covered.numpy()
-        visible += worth * (found.visible if outside else found.covered).numpy()
-        if progress is not None:
-            progress(place + 1, len(ordered))
+    collecting = Collecting(
+        gaussians=gaussians, source=source, longest_side=longest_side, backend=backend
+    )
+    with closing(executor.map(view_entries, ordered, shared=collecting)) as found:
+        for place, view in enumerate(found):
+            rows += [(place, *row) for row in view.rows]
+            entries.add(view.counts, view.gaussian, view.mass, view.seen)
+            covered += view.covered
+            visible += view.visible
+            if progress is not None:
+                progress(place + 1, len(ordered))
     if not rows:
         raise InputError(f"evidence: expected a segment in {len(views)} views, found none.")
     view_of, name_of, category, score, level, objectness = (
@@ -463,68 +444,3 @@ def _shares_of(covered: NDArray[np.float64], visible: NDArray[np.float64]) -> ND
     """Shares of what is visible; 1 where next to nothing is."""
     shares = np.where(visible > _MIN_WEIGHT, covered / np.maximum(visible, _MIN_WEIGHT), 1.0)
     return shares.clip(0, 1).astype(np.float32)
-
-
-def _add(
-    entries: SegmentEntries, found: ViewMasses, names: Sequence[int], pixel: float, *, outside: bool
-) -> None:
-    """Add a view's masses, segments in the order of their names.
-
-    Args:
-        entries: What they are added to.
-        found: The masses.
-        names: The segments in order.
-        pixel: Pixels of the segments as they came in one pixel of the masses.
-        outside: Whether pixels in no segment tell something: those outside all masks do, those
-            without a label do not.
-    """
-    count = len(found.visible)
-    segment, gaussian = found.segment.numpy(), found.gaussian.numpy()
-    kept = found.weight.numpy() > _MIN_MASS
-    segment, gaussian = segment[kept], gaussian[kept].astype(np.int32)
-    mass = (pixel * found.weight.numpy()[kept]).astype(np.float32)
-    visible = pixel * found.visible.numpy() if outside else np.bincount(gaussian, mass, count)
-    bounds = np.searchsorted(segment, names), np.searchsorted(segment, names, side="right")
-    runs = [np.arange(first, last) for first, last in zip(*bounds, strict=True)]
-    order = np.concatenate([np.zeros(0, np.int64), *runs])
-    entries.add(bounds[1] - bounds[0], gaussian[order], mass[order], visible.astype(np.float32))
-
-
-def _in_order(segments: LabelMap | MaskSet) -> tuple[list[int], list[float]]:
-    """Names of segments by their first pixel, of masks with the same one by area, and scores."""
-    if isinstance(segments, MaskSet):
-        starts = [
-            (
-                _first_pixel(segments, i),
-                mask.area,
-                mask.counts.tobytes(),
-                int(segments.levels[i]),
-                i,
-            )
-            for i, mask in enumerate(segments.masks)
-        ]
-        order = [i for _, area, _, _, i in sorted(starts) if area > 0]
-        return order, [float(segments.scores[i]) for i in order]
-    ids = segments.ids.reshape(-1).numpy()
-    names, first = np.unique(ids, return_index=True)
-    pairs = sorted(
-        (int(at), int(name)) for name, at in zip(names, first, strict=True) if name != UNLABELLED
-    )
-    if segments.confidence is None:
-        return [name for _, name in pairs], [1.0] * len(pairs)
-    sure = segments.confidence.reshape(-1)
-    return [name for _, name in pairs], [float(sure[at]) for at, _ in pairs]
-
-
-def _kind_of(segments: LabelMap | MaskSet, name: int) -> tuple[int, float]:
-    """The granularity and the objectness of a mask; segments of label maps have none."""
-    if not isinstance(segments, MaskSet):
-        return 0, np.nan
-    known = segments.objectness
-    return int(segments.levels[name]), np.nan if known is None else float(known[name])
-
-
-def _first_pixel(segments: MaskSet, index: int) -> int:
-    """The first pixel of a mask down the columns; behind all others where it is empty."""
-    counts = segments.masks[index].counts
-    return int(counts[0]) if len(counts) > 1 else segments.height * segments.width

@@ -14,7 +14,9 @@ import torch
 from torch import Tensor
 
 from splatseg.core import (
+    LOCAL,
     UNLABELLED,
+    Executor,
     Gaussians,
     InstanceTree,
     LabelMap,
@@ -45,6 +47,7 @@ def with_views(
     associated: Callable[[SegmentSource, Sequence[View]], Labels | InstanceTree],
     longest_side: int,
     backend: str = "auto",
+    executor: Executor = LOCAL,
     progress: Callable[[int, int], None] | None = None,
 ) -> Labels | InstanceTree:
     """A layer of instances with the segments of further views.
@@ -57,6 +60,7 @@ def with_views(
         associated: Association of segments that are none of the known instances.
         longest_side: Longest side at which segments are read, pixels.
         backend: Name of the rendering backend.
+        executor: Where views are worked on.
         progress: Called with the views done and all there are.
 
     Returns:
@@ -81,6 +85,7 @@ def with_views(
             _Maps(shown),
             options=UpliftOptions().with_candidates(CANDIDATES),
             backend=backend,
+            executor=executor,
             progress=progress,
         )
         known = with_votes(known, votes)

@@ -76,6 +76,7 @@ def linked_labels(inputs: MethodInputs) -> LinkedLabels:
         segments,
         classes=inputs.categories,
         backend=inputs.backend,
+        executor=inputs.executor,
     )
     flat = objects.cut("object") if isinstance(objects, InstanceTree) else objects
     return LinkedLabels(

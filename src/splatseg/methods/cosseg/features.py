@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from splatseg.core import FeatureMap, Gaussians, View
+from splatseg.core import LOCAL, Executor, FeatureMap, Gaussians, View
 from splatseg.core.models import DeepFeatures
 from splatseg.errors import InputError, ShapeError
 from splatseg.lift.voting.features import FeatureUpliftOptions, uplift_features
@@ -239,6 +239,7 @@ def distilled_features(
     *,
     pixels: Int64[Tensor, "n"] | None = None,
     backend: str = "auto",
+    executor: Executor = LOCAL,
     progress: Callable[[int, int], None] | None = None,
 ) -> DistilledFeatures:
     """Lift every block onto Gaussians, each view read once.
@@ -249,6 +250,7 @@ def distilled_features(
         source: Their features.
         pixels: What sums are divided by, of `pixel_counts`; None divides by blending weights.
         backend: Name of the rendering backend.
+        executor: Where the views are worked on; the features do not depend on it.
         progress: Called with the views done and all there are.
 
     Raises:
@@ -263,6 +265,7 @@ def distilled_features(
         reduced,
         options=FeatureUpliftOptions(longest_side=LIFTED_SIDE),
         backend=backend,
+        executor=executor,
         progress=progress,
     )
     seen = torch.ones(len(gaussians)) if lifted.weights is None else lifted.weights

@@ -127,7 +127,12 @@ def prepare(
     distilled = None
     if features is not None and options.semantic != "none":
         distilled = distilled_features(
-            gaussians, data.views, features, pixels=counts, backend=context.backend
+            gaussians,
+            data.views,
+            features,
+            pixels=counts,
+            backend=context.backend,
+            executor=context.executor,
         )
     encoder = frame = None
     if options.spatial != "none":

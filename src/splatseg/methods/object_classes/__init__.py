@@ -37,8 +37,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatseg.core import (
+    LOCAL,
     UNLABELLED,
     ClassTable,
+    Executor,
     Gaussians,
     InstanceTree,
     LabelMap,
@@ -147,6 +149,7 @@ def run(inputs: MethodInputs, options: ObjectLabelOptions) -> Labels:
         classes=inputs.label_names if evidence.kind == "labels" else inputs.categories,
         categories=_categories(evidence, inputs.categories) if tracked else None,
         backend=inputs.backend,
+        executor=inputs.executor,
         progress=inputs.progress,
     )
     if found.classes is None or evidence.kind != "labels":
@@ -192,6 +195,7 @@ def label_objects(
     classes: ClassTable | None = None,
     categories: Mapping[int, Mapping[int, float]] | None = None,
     backend: str = "auto",
+    executor: Executor = LOCAL,
     progress: Callable[[int, int], None] | None = None,
 ) -> ObjectLabels:
     """Associate masks, and find the class of each object.
@@ -206,6 +210,7 @@ def label_objects(
         classes: Names of the classes.
         categories: Of tracks, how much speaks for which class. None: labels are classes.
         backend: Name of the rendering backend.
+        executor: Where the views are worked on; the layers do not depend on it.
         progress: Called with the stages done and all there are.
 
     Raises:
@@ -225,9 +230,10 @@ def label_objects(
         options=UpliftOptions(candidates=CANDIDATES),
         classes=classes,
         backend=backend,
+        executor=executor,
     )
     tell(1)
-    instances = associate(gaussians, views, masks, backend=backend)
+    instances = associate(gaussians, views, masks, backend=backend, executor=executor)
     # Those of a tree where segments may overlap.
     objects = instances.cut("object") if isinstance(instances, InstanceTree) else instances
     tell(2)
@@ -239,6 +245,7 @@ def label_objects(
             views,
             features,
             backend=backend,
+            executor=executor,
         )
         scales = distilled.scales[-1:]
         weights = distilled.weights

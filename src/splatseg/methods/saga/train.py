@@ -285,7 +285,13 @@ def _started(
     if options.is_published:
         drawn = rng.standard_normal((len(gaussians), CHANNELS), dtype=np.float32)
         return torch.from_numpy(drawn), None
-    found = associate_masks(gaussians, views, MaskSegments(evidence), backend=context.backend)
+    found = associate_masks(
+        gaussians,
+        views,
+        MaskSegments(evidence),
+        backend=context.backend,
+        executor=context.executor,
+    )
     nodes = np.concatenate([found.nodes[view.name] for view in views])
     start = association_start(found.tree, CHANNELS, rng)
     return start, level_masks(found.tree, torch.from_numpy(nodes))
