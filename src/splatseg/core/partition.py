@@ -1,7 +1,7 @@
 r"""Space in overlapping blocks, and what each block counts at a point.
 
-With :math:`\delta_b(x)` the distance of a point from the core of block b, such as a piece of a drive
-or a cell of a plan, and o the overlap, blocks count
+With :math:`\delta_b(x)` the distance of a point from the core of block b, such as a piece of a
+drive or a cell of a plan, and o the overlap, blocks count
 
 .. math:: w_b(x) = \frac{g_b(x)}{\sum_c g_c(x)}, \qquad
           g_b(x) = \operatorname{clip}\left(\frac12 + \frac{\min_{c \ne b} \delta_c(x)
@@ -14,10 +14,15 @@ the point alone and continuous everywhere.
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
+
+from splatseg._check import check_finite, check_shape
+from splatseg.core.boundary import boundary, convert_fields
+from splatseg.errors import InputError
 
 _POINTS = 16384
 
@@ -118,3 +123,205 @@ def _weights(
         total += row
     for block, row in zip(order, counts, strict=True):
         yield block, row / total
+
+
+# Cells of a plan.
+
+
+_SLACK = 0.1
+"""Share of the views by which halves may differ from their part, for a cut between rooms."""
+
+_OVERLAP = 0.2
+"""Overlap of neighbours, in sides of a square cell of the usual size: as VastGaussian's."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Cells:
+    """Cells of a plan. They tile space; neighbours overlap.
+
+    Raises:
+        ShapeError: If an array has another shape.
+        InputError: If there is no cell.
+    """
+
+    axes: Float[Tensor, "2 3"]
+    """Orthonormal axes of the plan in the world, float64."""
+
+    low: Float[Tensor, "b 2"]
+    """Lowest corners of the cells along the axes, scene units; minus infinity where one has no
+    end."""
+
+    high: Float[Tensor, "b 2"]
+    """Highest corners, not part of them."""
+
+    overlap: float
+    """Width of the overlap across a border, half of it on either side, scene units."""
+
+    def __post_init__(self) -> None:
+        convert_fields(self)
+        check_shape("axes", self.axes, (2, 3))
+        check_shape("low", self.low, (None, 2))
+        check_shape("high", self.high, (len(self.low), 2))
+        if not len(self.low):
+            raise InputError("low, high: expected at least one cell, got none.")
+
+    def __len__(self) -> int:
+        return len(self.low)
+
+    @boundary
+    def shares(self, points: Float[Tensor, "p 3"]) -> tuple[BlockShare, ...]:
+        """What blocks count at points, see `core.partition`: anything within half an overlap.
+
+        Args:
+            points: World, scene units.
+
+        Raises:
+            ShapeError: If the points are not (p, 3).
+            RangeError: If one is not finite.
+        """
+        check_shape("points", points, (None, 3))
+        check_finite("points", points)
+        return block_shares(
+            self._plan(points),
+            self._distances,
+            low=self.low,
+            high=self.high,
+            overlap=self.overlap,
+        )
+
+    @boundary
+    def cell_of(self, points: Float[Tensor, "p 3"]) -> Int[Tensor, "p"]:
+        """The number of the cell that each point is in, int64; world, scene units."""
+        return owners(self.shares(points), len(points))
+
+    @boundary
+    def regions(self, points: Float[Tensor, "p 3"]) -> Bool[Tensor, "b p"]:
+        """Which points are in the region of each block; world, scene units."""
+        inside = torch.zeros(len(self), len(points), dtype=torch.bool)
+        for share in self.shares(points):
+            inside[share.block, share.rows] = True
+        return inside
+
+    def record(self) -> dict[str, Any]:
+        """Values that JSON holds; None is infinite."""
+
+        def rows(corners: Tensor) -> list[list[float | None]]:
+            return [[v if math.isfinite(v) else None for v in row] for row in corners.tolist()]
+
+        return {
+            "axes": self.axes.tolist(),
+            "low": rows(self.low),
+            "high": rows(self.high),
+            "overlap": self.overlap,
+        }
+
+    def _distances(self, places: Float[Tensor, "p 2"], block: int) -> Float[Tensor, "p"]:
+        outside = torch.maximum(self.low[block] - places, places - self.high[block])
+        return torch.linalg.vector_norm(outside.clamp_min(0), dim=1)
+
+    def _plan(self, points: Float[Tensor, "p 3"]) -> Float[Tensor, "p 2"]:
+        return points.detach().cpu().double() @ self.axes.T
+
+
+@boundary
+def plan_axes(
+    centres: Float[Tensor, "n 3"], up: Sequence[float] | None = None
+) -> Float[Tensor, "2 3"]:
+    """Axes of the plan: level, along the sides of the smallest rectangle around the cameras.
+
+    Args:
+        centres: Centres of cameras, world.
+        up: Away from the ground; None takes the direction in which cameras are spread least.
+
+    Returns:
+        Orthonormal, float64.
+    """
+    places = centres.double()
+    if up is None:
+        offset = places - places.mean(dim=0)
+        normal = torch.linalg.eigh(offset.T @ offset).eigenvectors[:, 0]
+    else:
+        normal = torch.nn.functional.normalize(torch.tensor(up, dtype=torch.float64), dim=0)
+    first = torch.zeros(3, dtype=torch.float64)
+    first[int(normal.abs().argmin())] = 1.0
+    first = torch.nn.functional.normalize(first - (first @ normal) * normal, dim=0)
+    second = torch.linalg.cross(normal, first)
+    best, area = torch.stack((first, second)), math.inf
+    for degrees in range(90):
+        c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+        axes = torch.stack((c * first + s * second, c * second - s * first))
+        plan = places @ axes.T
+        sides = plan.amax(dim=0) - plan.amin(dim=0)
+        # By more than rounding, so that a plan that lies along the world's axes keeps them.
+        if float(sides.prod()) < area * (1 - 1e-9):
+            best, area = axes, float(sides.prod())
+    return best
+
+
+@boundary
+def cut_plan(
+    centres: Float[Tensor, "n 3"], count: int, *, up: Sequence[float] | None = None
+) -> Cells:
+    """Cells with equally many cameras, cut where these stand farthest apart.
+
+    The plan is halved again and again across its longer side, within a tenth of the cameras of
+    equal parts. The outermost cells have no end. The overlap is a fifth of the side of a square
+    cell of the usual size (VastGaussian, Lin et al. 2024, section 4.1).
+
+    Args:
+        centres: Of cameras, world, scene units.
+        count: Number of cells.
+        up: Away from the ground; None takes the direction in which cameras are spread least.
+
+    Raises:
+        InputError: If there are fewer cameras at different places than cells.
+
+    Example:
+        >>> line = torch.tensor([[0.0, 0, 0], [1, 0, 0], [5, 0, 0], [6, 0, 0]])
+        >>> cells = cut_plan(line, 2, up=(0, 0, 1))
+        >>> cells.cell_of(line).tolist()
+        [0, 0, 1, 1]
+    """
+    check_shape("centres", centres, (None, 3))
+    check_finite("centres", centres)
+    if not 1 <= count <= len(centres):
+        raise InputError(f"blocks: expected 1 to {len(centres)}, as many as cameras, got {count}.")
+    places = centres.detach().cpu().double()
+    axes = plan_axes(places, up)
+    plan = places @ axes.T
+    cells = list(_halved(plan, count, *torch.tensor([[-math.inf] * 2, [math.inf] * 2]).double()))
+    low, high = (torch.stack(corners) for corners in zip(*cells, strict=True))
+    # A camera wide where they stand on a line, or in one place.
+    sides = (plan.amax(dim=0) - plan.amin(dim=0)).sort(descending=True).values.tolist()
+    side = math.sqrt(sides[0] / count * max(sides[1], sides[0] / count)) or 1.0
+    return Cells(axes=axes, low=low, high=high, overlap=_OVERLAP * side)
+
+
+def _halved(plan: Tensor, count: int, low: Tensor, high: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+    """Cut a cell into some, where their cameras are farthest apart among nearly equal halves."""
+    if count == 1:
+        yield low, high
+        return
+    first = count // 2
+    for axis in (plan.amax(dim=0) - plan.amin(dim=0)).argsort(descending=True).tolist():
+        ordered = plan[:, axis].sort().values
+        gaps = ordered[1:] - ordered[:-1]
+        left = torch.arange(1, len(ordered))
+        # Each side needs a camera a cell.
+        possible = (gaps > 0) & (left >= first) & (len(ordered) - left >= count - first)
+        if not bool(possible.any()):
+            continue
+        off = (left - len(ordered) * first / count).abs()
+        near = possible & (off <= max(_SLACK * len(ordered), float(off[possible].min())))
+        at = int(torch.where(near, gaps, -1.0).argmax())
+        border = (ordered[at] + ordered[at + 1]) / 2
+        lower_high, upper_low = high.clone(), low.clone()
+        lower_high[axis] = upper_low[axis] = border
+        below = plan[:, axis] < border
+        yield from _halved(plan[below], first, low, lower_high)
+        yield from _halved(plan[~below], count - first, upper_low, high)
+        return
+    raise InputError(
+        f"blocks: expected at most as many as cameras at different places of the plan, got more: "
+        f"{len(plan)} in one place cannot be parted into {count}."
+    )

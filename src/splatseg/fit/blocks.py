@@ -1,18 +1,19 @@
 """A capture in blocks: cells of its plan, each fitted by itself, and joined without a seam.
 
-The plan of the training cameras, seen along the capture's up axis, is halved again and again between
-cameras, so that cells have equally many (VastGaussian, Lin et al. 2024, section 4.1; CityGaussian,
-Liu et al. 2024). The outermost cells have no end: cells tile space, and each point has one.
+The plan of the training cameras, seen along the capture's up axis, is halved again and again
+between cameras, so that cells have equally many (VastGaussian, Lin et al. 2024, section 4.1;
+CityGaussian, Liu et al. 2024). The outermost cells have no end: each point is in one cell.
 
-A block is more than its cell. Its views are those that stand in its cell, which know that the air
-in it is empty, and those that see enough of its region, the cell with half an overlap around it. What
-they see is told by the blending weights of Gaussians at the start points, so that walls hide what is
-behind them. Its start points are those of its region and those that its views see: what is beyond
-would otherwise be fitted by floaters in front. Of its Gaussians only those of its cell are kept.
+A block is more than its cell. Its views are those that stand in its cell, which know that the
+air in it is empty, and those that see enough of its region, the cell with half an overlap around
+it. What they see is told by the blending weights of Gaussians at the start points, so that walls
+hide what is behind them. Its start points are those of its region and those that its views see:
+what is beyond would otherwise be fitted by floaters in front. Of its Gaussians only those of its
+cell are kept.
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -22,12 +23,12 @@ from jaxtyping import Bool, Float, Int
 from msgspec import Meta
 from torch import Tensor
 
-from splatseg._check import check_finite, check_shape
-from splatseg.core import Capture, Gaussians, View
-from splatseg.core.boundary import boundary, convert_fields
+from splatseg.core import Capture, Gaussians, PointCloud, View
+from splatseg.core.boundary import boundary
 from splatseg.core.checkpoints import Checkpoints, deferred_interrupts
-from splatseg.core.partition import BlockShare, block_shares, owners
+from splatseg.core.partition import Cells, cut_plan
 from splatseg.errors import InputError
+from splatseg.fit._objects import ObjectSupervision
 from splatseg.fit._options import FitOptions
 from splatseg.fit._parameters import final_gaussians
 from splatseg.fit._run import FitProgress, FitRecord, FitResult, fit
@@ -41,12 +42,6 @@ _VIEWS, _GAUSSIANS = 150, 1_000_000
 """Of a block, at most, where their number is chosen: training views that stand in its cell, and its
 part of `FitOptions.max_gaussians`."""
 
-_OVERLAP = 0.2
-"""Overlap of neighbours, in sides of a square cell of the usual size: as VastGaussian's."""
-
-_SLACK = 0.1
-"""Share of the views by which halves may differ from their part, for a cut between rooms."""
-
 _MIN_SHARE = 0.15
 """Share of what a view shows that lies in the region of a block, for it to be a view of it."""
 
@@ -59,93 +54,6 @@ _LONGEST = 128
 _OPACITY = 0.95
 _POINTS = 200_000
 """Start points by which it is told, at most."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Cells:
-    """Cells of a plan. They tile space; neighbours overlap.
-
-    Raises:
-        ShapeError: If an array has another shape.
-        InputError: If there is no cell.
-    """
-
-    axes: Float[Tensor, "2 3"]
-    """Orthonormal axes of the plan in the world, float64."""
-
-    low: Float[Tensor, "b 2"]
-    """Lowest corners of the cells along the axes, scene units; minus infinity where one has no
-    end."""
-
-    high: Float[Tensor, "b 2"]
-    """Highest corners, not part of them."""
-
-    overlap: float
-    """Width of the overlap across a border, half of it on either side, scene units."""
-
-    def __post_init__(self) -> None:
-        convert_fields(self)
-        check_shape("axes", self.axes, (2, 3))
-        check_shape("low", self.low, (None, 2))
-        check_shape("high", self.high, (len(self.low), 2))
-        if not len(self.low):
-            raise InputError("low, high: expected at least one cell, got none.")
-
-    def __len__(self) -> int:
-        return len(self.low)
-
-    @boundary
-    def shares(self, points: Float[Tensor, "p 3"]) -> tuple[BlockShare, ...]:
-        """What blocks count at points, see `core.partition`: anything within half an overlap.
-
-        Args:
-            points: World, scene units.
-
-        Raises:
-            ShapeError: If the points are not (p, 3).
-            RangeError: If one is not finite.
-        """
-        check_shape("points", points, (None, 3))
-        check_finite("points", points)
-        return block_shares(
-            self._plan(points),
-            lambda places, block: torch.linalg.vector_norm(
-                torch.maximum(self.low[block] - places, places - self.high[block]).clamp_min(0),
-                dim=1,
-            ),
-            low=self.low,
-            high=self.high,
-            overlap=self.overlap,
-        )
-
-    @boundary
-    def cell_of(self, points: Float[Tensor, "p 3"]) -> Int[Tensor, "p"]:
-        """The number of the cell that each point is in, int64; world, scene units."""
-        return owners(self.shares(points), len(points))
-
-    @boundary
-    def regions(self, points: Float[Tensor, "p 3"]) -> Bool[Tensor, "b p"]:
-        """Which points are in the region of each block; world, scene units."""
-        inside = torch.zeros(len(self), len(points), dtype=torch.bool)
-        for share in self.shares(points):
-            inside[share.block, share.rows] = True
-        return inside
-
-    def record(self) -> dict[str, Any]:
-        """Values that JSON holds; None is infinite."""
-
-        def rows(corners: Tensor) -> list[list[float | None]]:
-            return [[v if math.isfinite(v) else None for v in row] for row in corners.tolist()]
-
-        return {
-            "axes": self.axes.tolist(),
-            "low": rows(self.low),
-            "high": rows(self.high),
-            "overlap": self.overlap,
-        }
-
-    def _plan(self, points: Float[Tensor, "p 3"]) -> Float[Tensor, "p 2"]:
-        return points.detach().cpu().double() @ self.axes.T
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -210,7 +118,8 @@ def cut_capture(
     views = tuple(view for view in capture.train_views if view.image is not None)
     if not views:
         raise InputError(f"{capture.path}: expected training views with photographs, got none.")
-    if capture.points is None or not len(capture.points):
+    points = capture.points
+    if points is None or not len(points):
         raise InputError(
             f"{capture.path}: expected a capture with start points, by which blocks are cut, got "
             "one without."
@@ -224,14 +133,13 @@ def cut_capture(
             f"got {count}."
         )
     centres = torch.stack([view.camera.centre for view in views]).double()
-    cells = _cut(centres, plan_axes(centres, capture.up), count)
-    of_view, of_point = _members(capture, views, cells, options, backend)
+    cells = cut_plan(centres, count, up=capture.up)
+    of_view, of_point = _members(capture, points, views, cells, options=options, backend=backend)
     steps = _parts(options.steps, of_view.sum(dim=1)) if options.steps is not None else None
     blocks: list[CaptureBlock] = []
     for i in range(count):
         own = of_view[i]
         share = float(own.sum()) / float(of_view.sum())
-        points = capture.points
         rows = of_point[i]
         blocks.append(
             CaptureBlock(
@@ -267,97 +175,21 @@ def _check_options(options: FitOptions) -> None:
         raise InputError("strategy: expected mcmc or classic with blocks, got fixed.")
 
 
-@boundary
-def plan_axes(
-    centres: Float[Tensor, "n 3"], up: Sequence[float] | None = None
-) -> Float[Tensor, "2 3"]:
-    """Axes of the plan: level, along the sides of the smallest rectangle around the cameras.
-
-    Args:
-        centres: Centres of cameras, world.
-        up: Away from the ground; None takes the direction in which cameras are spread least.
-
-    Returns:
-        Orthonormal, float64.
-    """
-    places = centres.double()
-    if up is None:
-        offset = places - places.mean(dim=0)
-        normal = torch.linalg.eigh(offset.T @ offset).eigenvectors[:, 0]
-    else:
-        normal = torch.nn.functional.normalize(torch.tensor(up, dtype=torch.float64), dim=0)
-    first = torch.zeros(3, dtype=torch.float64)
-    first[int(normal.abs().argmin())] = 1.0
-    first = torch.nn.functional.normalize(first - (first @ normal) * normal, dim=0)
-    second = torch.linalg.cross(normal, first)
-    best, area = torch.stack((first, second)), math.inf
-    for degrees in range(90):
-        c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
-        axes = torch.stack((c * first + s * second, c * second - s * first))
-        plan = places @ axes.T
-        sides = plan.amax(dim=0) - plan.amin(dim=0)
-        # By more than rounding, so that a plan that lies along the world's axes keeps them.
-        if float(sides.prod()) < area * (1 - 1e-9):
-            best, area = axes, float(sides.prod())
-    return best
-
-
-def _cut(centres: Float[Tensor, "n 3"], axes: Float[Tensor, "2 3"], count: int) -> Cells:
-    """Cells with equally many cameras."""
-    plan = centres @ axes.T
-    cells = list(_halved(plan, count, *torch.tensor([[-math.inf] * 2, [math.inf] * 2]).double()))
-    low, high = (torch.stack(corners) for corners in zip(*cells, strict=True))
-    # A camera wide where they stand on a line, or in one place.
-    sides = (plan.amax(dim=0) - plan.amin(dim=0)).sort(descending=True).values.tolist()
-    side = math.sqrt(sides[0] / count * max(sides[1], sides[0] / count)) or 1.0
-    return Cells(axes=axes, low=low, high=high, overlap=_OVERLAP * side)
-
-
-def _halved(plan: Tensor, count: int, low: Tensor, high: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
-    """Cut a cell into some, where their cameras are farthest apart among nearly equal halves."""
-    if count == 1:
-        yield low, high
-        return
-    first = count // 2
-    for axis in (plan.amax(dim=0) - plan.amin(dim=0)).argsort(descending=True).tolist():
-        ordered = plan[:, axis].sort().values
-        gaps = ordered[1:] - ordered[:-1]
-        left = torch.arange(1, len(ordered))
-        # Each side needs a camera a cell.
-        possible = (gaps > 0) & (left >= first) & (len(ordered) - left >= count - first)
-        if not bool(possible.any()):
-            continue
-        off = (left - len(ordered) * first / count).abs()
-        near = possible & (off <= max(_SLACK * len(ordered), float(off[possible].min())))
-        at = int(torch.where(near, gaps, -1.0).argmax())
-        border = (ordered[at] + ordered[at + 1]) / 2
-        lower_high, upper_low = high.clone(), low.clone()
-        lower_high[axis] = upper_low[axis] = border
-        below = plan[:, axis] < border
-        yield from _halved(plan[below], first, low, lower_high)
-        yield from _halved(plan[~below], count - first, upper_low, high)
-        return
-    raise InputError(
-        f"blocks: expected at most as many as cameras at different places of the plan, got more: "
-        f"{len(plan)} in one place cannot be parted into {count}."
-    )
-
-
 def _members(
-    capture: Capture, views: Sequence[View], cells: Cells, options: FitOptions, backend: str
+    capture: Capture,
+    cloud: PointCloud,
+    views: Sequence[View],
+    cells: Cells,
+    *,
+    options: FitOptions,
+    backend: str,
 ) -> tuple[Bool[Tensor, "b v"], Bool[Tensor, "b p"]]:
     """Which views and which start points each block has."""
-    cloud = capture.points
-    assert_points = torch.zeros(0, 3) if cloud is None else cloud.points
-    stride = max(1, math.ceil(len(assert_points) / _POINTS))
-    told = torch.arange(0, len(assert_points), stride)
-    some = replace(
-        capture,
-        views=tuple(views),
-        points=None if cloud is None else replace(cloud, points=cloud.points[told], colours=None),
-    )
-    shown = _opaque_points(some, options)
-    regions = cells.regions(assert_points)
+    points = cloud.points
+    told = torch.arange(0, len(points), max(1, math.ceil(len(points) / _POINTS)))
+    some = PointCloud(points=points[told])
+    shown = _opaque_points(replace(capture, views=tuple(views), points=some), options)
+    regions = cells.regions(points)
     own = regions[:, told].float()
     at = cells.cell_of(torch.stack([view.camera.centre for view in views]))
     of_view = torch.zeros(len(cells), len(views), dtype=torch.bool)
@@ -420,6 +252,9 @@ class BlockFits:
     progress: Callable[[int, FitProgress], None] | None = None
     """Called after every step with the number of the block."""
 
+    objects: Callable[[Capture], ObjectSupervision] | None = None
+    """Gives the evidence of objects in the views of a block; None is none."""
+
     def checkpoints_of(self, block: CaptureBlock) -> Checkpoints | None:
         """Of one block: its last one stays, as what was fitted."""
         if self.checkpoints is None:
@@ -450,6 +285,7 @@ def fit_block(shared: BlockFits, block: CaptureBlock) -> FitResult:
         backend=shared.backend,
         progress=None if report is None else lambda status: report(block.index, status),
         checkpoints=shared.checkpoints_of(block),
+        objects=None if shared.objects is None else shared.objects(block.capture),
     )
     own = shared.cells.cell_of(result.gaussians.means) == block.index
     return replace(result, gaussians=result.gaussians[own])
@@ -462,6 +298,7 @@ def fit_blocks(
     backend: str = "auto",
     progress: Callable[[int, FitProgress], None] | None = None,
     checkpoints: Checkpoints | None = None,
+    objects: Callable[[Capture], ObjectSupervision] | None = None,
 ) -> FitResult:
     """Fit the blocks of a capture one after the other, and join them.
 
@@ -473,14 +310,13 @@ def fit_blocks(
         progress: Called after every step with the number of the block.
         checkpoints: Where and how often blocks write checkpoints, its path a folder. A finished
             block leaves its last one, from which a resumed fit takes it. None writes none.
+        objects: Gives the evidence of objects in the views of a block; None is none.
 
     Raises:
         InputError: As `fit`.
         KeyboardInterrupt: If it was interrupted; the message says how many blocks are fitted.
     """
-    shared = BlockFits(
-        cells=cut.cells, backend=backend, checkpoints=checkpoints, progress=progress
-    )
+    shared = BlockFits(cells=cut.cells, backend=backend, checkpoints=checkpoints, progress=progress)
     results: list[FitResult] = []
     with deferred_interrupts() as interrupts:
         for result in (fit_block(shared, block) for block in cut.blocks):

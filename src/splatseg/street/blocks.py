@@ -1,9 +1,9 @@
 """A drive cut into overlapping blocks.
 
 The line of the drive is cut into consecutive pieces of equal length, which are the cores of its
-blocks. What each counts at a point is in `core.partition`: on the line of the drive it goes linearly
-from 1 to 0 over the overlap around the end of a piece; inside of bends and where a drive crosses
-itself the blocks of all passes count.
+blocks. What each counts at a point is in `core.partition`: on the line of the drive it goes
+linearly from 1 to 0 over the overlap around the end of a piece; inside of bends and where a drive
+crosses itself the blocks of all passes count.
 """
 
 import math
@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from splatseg._check import check_finite, check_shape
