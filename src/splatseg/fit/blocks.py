@@ -5,9 +5,9 @@ between cameras, so that cells have equally many (VastGaussian, Lin et al. 2024,
 CityGaussian, Liu et al. 2024). The outermost cells have no end: each point is in one cell.
 
 A block is more than its cell. Its views are those that stand in its cell, which know that the
-air in it is empty, and those that see enough of its region, the cell with half an overlap around
-it. What they see is told by the blending weights of Gaussians at the start points, so that walls
-hide what is behind them. Its start points are those of its region and those that its views see:
+air in it is empty, and those that show enough of it. What they show is told by the blending
+weights of Gaussians at the start points, so that walls hide what is behind them. Its start points
+are those of its region, the cell with half an overlap around it, and those that its views see:
 what is beyond would otherwise be fitted by floaters in front. Of its Gaussians only those of its
 cell are kept.
 """
@@ -42,8 +42,9 @@ _VIEWS, _GAUSSIANS = 150, 1_000_000
 """Of a block, at most, where their number is chosen: training views that stand in its cell, and its
 part of `FitOptions.max_gaussians`."""
 
-_MIN_SHARE = 0.15
-"""Share of what a view shows that lies in the region of a block, for it to be a view of it."""
+_MIN_SHARE = 0.25
+"""Share of what a view shows that lies in the cell of a block, for it to be a view of it:
+as VastGaussian has it of the area."""
 
 _MIN_WEIGHT = 0.5
 """Pixels of a reduced view that a start point must fill, for it to be one of those seen."""
@@ -190,12 +191,13 @@ def _members(
     some = PointCloud(points=points[told])
     shown = _opaque_points(replace(capture, views=tuple(views), points=some), options)
     regions = cells.regions(points)
-    own = regions[:, told].float()
+    cell = cells.cell_of(points[told])
     at = cells.cell_of(torch.stack([view.camera.centre for view in views]))
     of_view = torch.zeros(len(cells), len(views), dtype=torch.bool)
     for i, view in enumerate(views):
         weights = _visibility(shown, view, backend)
-        of_view[:, i] = own @ weights >= _MIN_SHARE * weights.sum().clamp_min(1e-9)
+        shares = torch.zeros(len(cells)).index_add(0, cell, weights)
+        of_view[:, i] = shares >= _MIN_SHARE * shares.sum().clamp_min(1e-9)
         of_view[at[i], i] = True
         seen = told[weights >= _MIN_WEIGHT]
         for block in torch.nonzero(of_view[:, i]).squeeze(1).tolist():
@@ -316,7 +318,13 @@ def fit_blocks(
         InputError: As `fit`.
         KeyboardInterrupt: If it was interrupted; the message says how many blocks are fitted.
     """
-    shared = BlockFits(cells=cut.cells, backend=backend, checkpoints=checkpoints, progress=progress)
+    shared = BlockFits(
+        cells=cut.cells,
+        backend=backend,
+        checkpoints=checkpoints,
+        progress=progress,
+        objects=objects,
+    )
     results: list[FitResult] = []
     with deferred_interrupts() as interrupts:
         for result in (fit_block(shared, block) for block in cut.blocks):
