@@ -8,8 +8,8 @@ The capture is written to WORK/capture once; one view in eight is held out. Both
 
 - PSNR of held-out views (`score.py image` agrees to rounding); of those of their pixels whose true
   surface is within 15 cm of a border of two cells, and of all others.
-- instances: true maps through `uplift`; and as segments whose ids are each view's own and of which 8
-  of 100 are missing, through `associate`. Scored by the independent scorer (`labels.py`).
+- instances: true maps through `uplift`; and as segments whose ids are each view's own and of
+  which 8 of 100 are missing, through `associate`. Scored by the independent scorer (`labels.py`).
 
 WORK/seams/VIEW.png has the held-out views that show most on both sides of a border: photograph,
 whole, blocks, and four times their difference. The border's overlap is brighter in the photograph.
@@ -102,7 +102,7 @@ def seams(data: Path, cells: Cells, fields: Mapping[str, GaussianField], out: Pa
         second = float((of_cell / of_cell.sum()).sort(descending=True).values[1])
         ranked.append((second, view.name))
         for name, field in fields.items():
-            drawn, photograph = render_and_photograph(field, view)
+            drawn, photograph = _images(field, view)
             squared = ((drawn - photograph) ** 2).mean(dim=-1)
             errors.setdefault((name, "all pixels"), []).append(squared.reshape(-1))
             squared = squared[at[:, 0], at[:, 1]]
@@ -120,10 +120,16 @@ def seams(data: Path, cells: Cells, fields: Mapping[str, GaussianField], out: Pa
         _picture(data, by_name[name], narrow, fields).save(out / f"{name}.png")
 
 
+def _images(field: GaussianField, view: View) -> tuple[Tensor, Tensor]:
+    """The render and the photograph, in [0, 1]."""
+    drawn, photograph = render_and_photograph(field, view)
+    return drawn.float() / 255, photograph.float() / 255
+
+
 def _picture(
     data: Path, view: View, cells: Cells, fields: Mapping[str, GaussianField]
 ) -> Image.Image:
-    drawn = [render_and_photograph(field, view) for field in fields.values()]
+    drawn = [_images(field, view) for field in fields.values()]
     marked = drawn[0][1].clone()
     at, points = surface(data, view)
     at = at[cells.regions(points).sum(dim=0) > 1]
