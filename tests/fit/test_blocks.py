@@ -134,39 +134,44 @@ def test_a_view_that_sees_little_of_a_block_is_not_of_it():
     assert 3 < sum(told) < 22
 
 
-def test_steps_minutes_and_gaussians_are_shared():
+def test_each_view_counts_as_in_one_fit_and_gaussians_add_up():
     capture = rooms(wall=False)
-    cut = cut_capture(capture, 2, options=OPTIONS)
-    steps = [block.options.steps for block in cut.blocks]
-    assert steps == [500, 500]
-    odd = cut_capture(capture, 3, options=replace(OPTIONS, steps=1001))
-    shares = [len(block.capture.views) for block in odd.blocks]
-    assert len(set(shares)) > 1
-    assert sum(block.options.steps or 0 for block in odd.blocks) == 1001
-    for block, share in zip(odd.blocks, shares, strict=True):
-        assert block.options.steps == pytest.approx(1001 * share / sum(shares), abs=1)
-    timed = cut_capture(capture, 2, options=FitOptions(minutes=5.0))
-    assert sum(block.options.minutes or 0 for block in timed.blocks) == pytest.approx(5.0)
-    # Those of the cells add up to what one fit would have.
-    kept = 0.0
-    everything = capture.points.points
-    for block in odd.blocks:
-        points = block.capture.points
-        assert points is not None
-        own = float((odd.cells.cell_of(points.points) == block.index).sum()) / len(points)
-        kept += own * block.options.max_gaussians
+    options = replace(OPTIONS, densify_every=90, densify_from=240, reset_every=600)
+    cut = cut_capture(capture, 3, options=options)
+    views = [len(block.capture.views) for block in cut.blocks]
+    assert len(set(views)) > 1
+    kept, everything = 0.0, capture.points.points
+    for block, own in zip(cut.blocks, views, strict=True):
+        assert block.options.steps == round(1000 * own / 6)
+        assert block.options.densify_every == 90 * own / 6
+        assert block.options.densify_from == 240 * own / 6
+        assert block.options.reset_every == 600 * own / 6
+        assert block.options.bias_correction_steps == pytest.approx(6 / own)
+        points = block.capture.points.points
         assert block.options.max_gaussians == round(10_000 * len(points) / len(everything))
+        of_cell = float((cut.cells.cell_of(points) == block.index).sum()) / len(points)
+        kept += of_cell * block.options.max_gaussians
+    # Those of the cells add up to what one fit would have.
     assert kept == pytest.approx(10_000, abs=3)
-    rest = {"steps", "minutes", "max_gaussians"}
+    rest = (
+        "steps minutes max_gaussians densify_every densify_from reset_every bias_correction_steps"
+    )
     for name in FitOptions.__dataclass_fields__:
-        assert name in rest or getattr(odd.blocks[0].options, name) == getattr(OPTIONS, name)
+        assert name in rest or getattr(cut.blocks[0].options, name) == getattr(options, name)
+
+
+def test_minutes_add_up():
+    cut = cut_capture(rooms(wall=False), 3, options=FitOptions(minutes=5.0))
+    minutes = [block.options.minutes for block in cut.blocks]
+    assert sum(minutes) == pytest.approx(5.0)
+    views = [len(block.capture.views) for block in cut.blocks]
+    assert minutes == pytest.approx([5 * own / sum(views) for own in views])
+    assert all(block.options.steps is None for block in cut.blocks)
 
 
 def test_every_block_has_a_step():
-    cut = cut_capture(rooms(), 3, options=replace(OPTIONS, steps=3))
+    cut = cut_capture(rooms(), 3, options=replace(OPTIONS, steps=1))
     assert [block.options.steps for block in cut.blocks] == [1, 1, 1]
-    with pytest.raises(InputError, match="at least a step a block, 3, got 2"):
-        cut_capture(rooms(), 3, options=replace(OPTIONS, steps=2))
 
 
 def test_their_number_follows_views_and_gaussians(monkeypatch):
@@ -248,7 +253,7 @@ def test_of_each_block_the_gaussians_of_its_cell_are_joined(capture: Capture):
         parts.append(own)
     joined = fit_blocks(cut)
     assert same(joined.gaussians, Gaussians.concatenate(parts))
-    assert joined.steps == 24
+    assert joined.steps == sum(block.options.steps for block in cut.blocks)
     views = ", ".join(str(len(block.capture.views)) for block in cut.blocks)
     assert joined.notes == (f"2 blocks of {views} training views were fitted and joined.",)
 

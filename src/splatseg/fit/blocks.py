@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from msgspec import Meta
 from torch import Tensor
 
@@ -48,6 +48,9 @@ as VastGaussian has it of the area."""
 
 _MIN_WEIGHT = 0.5
 """Pixels of a reduced view that a start point must fill, for it to be one of those seen."""
+
+_BY_VIEWS = ("steps", "densify_every", "densify_from", "reset_every")
+"""Options that count steps."""
 
 _LONGEST = 128
 """Longest side of the views that tell what is seen, pixels."""
@@ -100,9 +103,12 @@ def cut_capture(
 ) -> CaptureBlocks:
     """Cut a capture into blocks that are fitted one by one.
 
-    A block's part of the steps, or of the minutes, is that of its views, so that all blocks
-    together take as long as one fit. Its part of the Gaussians is that of its start points among
-    all of the capture: those of the overlaps come on top, and are left out when blocks are joined.
+    A block's part of the steps is that of its views among all of the capture, so that each
+    view is learned from as often as in one fit; what several blocks learn from comes on top.
+    Intervals of density control and Adam's bias correction follow it: each Gaussian is optimised
+    as in one fit. Minutes are shared by the same numbers, and add up to those asked for. A
+    block's part of the Gaussians is that of its start points: those of other cells come on top,
+    and are left out when blocks are joined.
 
     Args:
         capture: With start points.
@@ -136,41 +142,36 @@ def cut_capture(
     centres = torch.stack([view.camera.centre for view in views]).double()
     cells = cut_plan(centres, count, up=capture.up)
     of_view, of_point = _members(capture, points, views, cells, options=options, backend=backend)
-    steps = _parts(options.steps, of_view.sum(dim=1)) if options.steps is not None else None
+    counts = of_view.sum(dim=1)
     blocks: list[CaptureBlock] = []
     for i in range(count):
-        own = of_view[i]
-        share = float(own.sum()) / float(of_view.sum())
-        rows = of_point[i]
-        blocks.append(
-            CaptureBlock(
-                index=i,
-                capture=replace(
-                    capture,
-                    views=tuple(v for v, is_own in zip(views, own.tolist(), strict=True) if is_own),
-                    points=replace(
-                        points,
-                        points=points.points[rows],
-                        colours=None if points.colours is None else points.colours[rows],
-                    ),
-                ),
-                options=replace(
-                    options,
-                    steps=None if steps is None else steps[i],
-                    minutes=None if options.minutes is None else options.minutes * share,
-                    max_gaussians=max(
-                        1, round(options.max_gaussians * int(rows.sum()) / len(points))
-                    ),
-                ),
-            )
+        own, rows = of_view[i].tolist(), of_point[i]
+        colours = None if points.colours is None else points.colours[rows]
+        part = replace(
+            capture,
+            views=tuple(view for view, is_own in zip(views, own, strict=True) if is_own),
+            points=replace(points, points=points.points[rows], colours=colours),
         )
+        of_views = float(counts[i]) / len(views)
+        of_points = float(rows.sum()) / len(points)
+        minutes = options.minutes
+        if minutes is not None:
+            minutes *= float(counts[i]) / float(counts.sum())
+        mine = replace(
+            options,
+            minutes=minutes,
+            **{name: _part(getattr(options, name), of_views) for name in _BY_VIEWS},
+            max_gaussians=_part(options.max_gaussians, of_points),
+            bias_correction_steps=options.bias_correction_steps / of_views,
+        )
+        blocks.append(CaptureBlock(index=i, capture=part, options=mine))
     return CaptureBlocks(cells=cells, blocks=tuple(blocks), capture=capture, options=options)
 
 
 def _check_options(options: FitOptions) -> None:
     """Refuse what blocks would each decide in their own way."""
-    for name, wanted in (("exposure", False), ("refine_poses", False)):
-        if getattr(options, name) is not wanted:
+    for name in ("exposure", "refine_poses"):
+        if getattr(options, name):
             raise InputError(f"{name}: expected none with blocks, which would not agree.")
     if options.strategy == "fixed":
         raise InputError("strategy: expected mcmc or classic with blocks, got fixed.")
@@ -224,18 +225,9 @@ def _visibility(shown: Gaussians, view: View, backend: str) -> Float[Tensor, "n"
         return prepared.back_project(torch.ones(height, width, 1)).weights.cpu()
 
 
-def _parts(total: int, shares: Int[Tensor, "n"]) -> list[int]:
-    """Whole numbers that add up to a total, near to its parts by shares, none of them 0.
-
-    Raises:
-        InputError: If there are fewer than parts.
-    """
-    if total < len(shares):
-        raise InputError(f"blocks: expected at least a step a block, {len(shares)}, got {total}.")
-    ends = (total * shares.cumsum(0).double() / shares.sum()).round().long().tolist()
-    for i in range(len(ends)):  # from both sides, where a part would be empty
-        ends[i] = min(max(ends[i], (ends[i - 1] if i else 0) + 1), total - (len(ends) - 1 - i))
-    return [end - begin for begin, end in zip([0, *ends], ends, strict=False)]
+def _part(value: int | None, share: float) -> int | None:
+    """A part of a whole number, at least 1."""
+    return None if value is None else max(1, round(value * share))
 
 
 # Fitting and joining.
