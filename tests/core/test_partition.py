@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from splatseg.core.partition import Cells, cut_plan, owners, plan_axes
+from splatseg.core.partition import Cells, Gap, cut_plan, owners, plan_axes
 from splatseg.errors import InputError, RangeError, ShapeError
 
 UP = (0.0, 0.0, 1.0)
@@ -75,6 +75,22 @@ def test_a_plan_is_cut_between_rooms_if_halves_stay_nearly_equal(wide, expected)
     assert torch.bincount(cells.cell_of(cameras)).tolist() == expected
     at = expected[0]
     assert float(cells.high[0, 0]) == pytest.approx(float(x[at - 1] + x[at]) / 2)
+
+
+def test_where_in_a_gap_the_border_is_can_be_said():
+    cameras = grid(4, 1, step=2.0)
+    heard: list[Gap] = []
+
+    def border(gap: Gap) -> float:
+        heard.append(gap)
+        return gap.first + 0.25
+
+    cells = cut_plan(cameras, 4, up=UP, border=border)
+    assert cells.high[:, 0].tolist() == [0.25, 2.25, 4.25, math.inf]
+    assert [(gap.first, gap.last) for gap in heard] == [(2, 4), (0, 2), (4, 6)]
+    assert [gap.before.tolist() for gap in heard] == [[0, 1], [0], [2]]
+    assert [gap.behind.tolist() for gap in heard] == [[2, 3], [1], [3]]
+    assert heard[0].direction.tolist() == [1, 0, 0]
 
 
 def test_the_longer_side_is_cut_first_and_parts_are_of_equal_weight():

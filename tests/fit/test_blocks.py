@@ -113,13 +113,32 @@ def test_without_the_wall_who_looks_there_is_of_both():
     assert 0 < int((beyond > half).sum()) < int((everything > half).sum())
 
 
-def test_a_view_of_its_cell_is_of_the_block_whatever_it_sees():
-    away = look_at((-1.0, 0, 1.2), (-1.0, 0.2, 90.0), width=64, height=48)
-    bare = View(name="sky", camera=away, image=Path("sky.png"))
-    capture = rooms(more=(bare, replace(bare, name="sky_2")))
-    capture = replace(capture, points=PointCloud(points=capture.points.points[::40]))
-    assert all("sky" in one for one in names(cut_capture(capture, 2, options=OPTIONS))[:1])
-    assert "sky" not in names(cut_capture(capture, 2, options=OPTIONS))[1]
+def test_a_view_is_of_the_block_it_stands_in_whatever_it_sees():
+    """Just before where the wall would be, it shows the other room and nothing of its own."""
+    away = look_at((-0.15, 0, 1.2), (3.9, 0.2, 1.2), width=64, height=48)
+    out = View(name="out", camera=away, image=Path("out.png"))
+    cut = cut_capture(rooms(wall=False, more=(out,)), 2, options=OPTIONS)
+    at = cut.cells.cell_of(away.centre[None])
+    assert int(at) == 0
+    assert all("out" in one for one in names(cut))
+
+
+def test_the_border_is_in_the_wall_though_cameras_stand_elsewhere():
+    """The wall is not half-way between the cameras of the rooms, and each room keeps its face."""
+    capture = rooms()
+    nearer = [
+        replace(view, camera=look_at((-0.6, 0, 1.2), (-3, y, 1.0), width=64, height=48))
+        for view, y in zip(capture.views[:2], (0.5, -0.5), strict=True)
+    ]
+    back = look_at((-3.5, 0, 1.2), (-HALF, 0, 1.2), width=64, height=48)
+    looks_back = View(name="back", camera=back, image=Path("back.png"))
+    capture = replace(capture, views=(*nearer, *capture.views[2:], looks_back))
+    middle = (-0.6 + 2.0) / 2
+    cut = cut_capture(capture, 2, options=OPTIONS)
+    assert abs(float(cut.cells.high[0, 0])) < HALF < middle
+    # With no wall it may be anywhere between them.
+    free = cut_capture(replace(capture, points=rooms(wall=False).points), 2, options=OPTIONS)
+    assert -0.6 < float(free.cells.high[0, 0]) < 2.0
 
 
 def test_a_view_that_sees_little_of_a_block_is_not_of_it():
@@ -178,6 +197,7 @@ def test_their_number_follows_views_and_gaussians(monkeypatch):
     assert len(cut_capture(rooms(), options=OPTIONS)) == 1
     many = replace(OPTIONS, max_gaussians=2_000_001)
     assert len(cut_capture(rooms(), options=many)) == 3
+    assert len(cut_capture(rooms(), options=replace(OPTIONS, max_gaussians=20_000_000))) == 6
     monkeypatch.setattr("splatseg.fit.blocks._VIEWS", 3)
     assert len(cut_capture(rooms(), "auto", options=OPTIONS)) == 2
 

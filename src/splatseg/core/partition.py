@@ -258,9 +258,32 @@ def plan_axes(
     return best
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Gap:
+    """Where a cell is cut: anywhere between two cameras that stand beside each other."""
+
+    direction: Float[Tensor, "3"]
+    """Axis that the cell is cut across, world, float64."""
+
+    first: float
+    """Along it the last camera before the cut."""
+
+    last: float
+    """The first one behind it."""
+
+    before: Int[Tensor, "n"]
+    """Numbers of the cell's cameras before it."""
+
+    behind: Int[Tensor, "m"]
+
+
 @boundary
 def cut_plan(
-    centres: Float[Tensor, "n 3"], count: int, *, up: Sequence[float] | None = None
+    centres: Float[Tensor, "n 3"],
+    count: int,
+    *,
+    up: Sequence[float] | None = None,
+    border: Callable[[Gap], float] | None = None,
 ) -> Cells:
     """Cells with equally many cameras, cut where these stand farthest apart.
 
@@ -272,6 +295,7 @@ def cut_plan(
         centres: Of cameras, world, scene units.
         count: Number of cells.
         up: Away from the ground; None takes the direction in which cameras are spread least.
+        border: Where in a gap the border is; None is its middle.
 
     Raises:
         InputError: If there are fewer cameras at different places than cells.
@@ -289,7 +313,9 @@ def cut_plan(
     places = centres.detach().cpu().double()
     axes = plan_axes(places, up)
     plan = places @ axes.T
-    cells = list(_halved(plan, count, *torch.tensor([[-math.inf] * 2, [math.inf] * 2]).double()))
+    ends = torch.tensor([[-math.inf] * 2, [math.inf] * 2]).double()
+    whole = _Cell(rows=torch.arange(len(plan)), low=ends[0], high=ends[1])
+    cells = [(c.low, c.high) for c in _halved(whole, plan, axes, count, border)]
     low, high = (torch.stack(corners) for corners in zip(*cells, strict=True))
     # A camera wide where they stand on a line, or in one place.
     sides = (plan.amax(dim=0) - plan.amin(dim=0)).sort(descending=True).values.tolist()
@@ -297,14 +323,27 @@ def cut_plan(
     return Cells(axes=axes, low=low, high=high, overlap=_OVERLAP * side)
 
 
-def _halved(plan: Tensor, count: int, low: Tensor, high: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Cell:
+    rows: Int[Tensor, "n"]
+    low: Float[Tensor, "2"]
+    high: Float[Tensor, "2"]
+
+
+def _halved(
+    cell: _Cell,
+    plan: Float[Tensor, "n 2"],
+    axes: Float[Tensor, "2 3"],
+    count: int,
+    border: Callable[[Gap], float] | None,
+) -> Iterator[_Cell]:
     """Cut a cell into some, where their cameras are farthest apart among nearly equal halves."""
     if count == 1:
-        yield low, high
+        yield cell
         return
-    first = count // 2
-    for axis in (plan.amax(dim=0) - plan.amin(dim=0)).argsort(descending=True).tolist():
-        ordered = plan[:, axis].sort().values
+    own, first = plan[cell.rows], count // 2
+    for axis in (own.amax(dim=0) - own.amin(dim=0)).argsort(descending=True).tolist():
+        ordered = own[:, axis].sort().values
         gaps = ordered[1:] - ordered[:-1]
         left = torch.arange(1, len(ordered))
         # Each side needs a camera a cell.
@@ -314,14 +353,23 @@ def _halved(plan: Tensor, count: int, low: Tensor, high: Tensor) -> Iterator[tup
         off = (left - len(ordered) * first / count).abs()
         near = possible & (off <= max(_SLACK * len(ordered), float(off[possible].min())))
         at = int(torch.where(near, gaps, -1.0).argmax())
-        border = (ordered[at] + ordered[at + 1]) / 2
-        lower_high, upper_low = high.clone(), low.clone()
-        lower_high[axis] = upper_low[axis] = border
-        below = plan[:, axis] < border
-        yield from _halved(plan[below], first, low, lower_high)
-        yield from _halved(plan[~below], count - first, upper_low, high)
+        below = own[:, axis] <= ordered[at]
+        gap = Gap(
+            direction=axes[axis],
+            first=float(ordered[at]),
+            last=float(ordered[at + 1]),
+            before=cell.rows[below],
+            behind=cell.rows[~below],
+        )
+        end = (gap.first + gap.last) / 2 if border is None else border(gap)
+        lower_high, upper_low = cell.high.clone(), cell.low.clone()
+        lower_high[axis] = upper_low[axis] = end
+        lower = _Cell(rows=gap.before, low=cell.low, high=lower_high)
+        upper = _Cell(rows=gap.behind, low=upper_low, high=cell.high)
+        yield from _halved(lower, plan, axes, first, border)
+        yield from _halved(upper, plan, axes, count - first, border)
         return
     raise InputError(
         f"blocks: expected at most as many as cameras at different places of the plan, got more: "
-        f"{len(plan)} in one place cannot be parted into {count}."
+        f"{len(own)} in one place cannot be parted into {count}."
     )

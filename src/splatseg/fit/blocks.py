@@ -19,14 +19,14 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from msgspec import Meta
 from torch import Tensor
 
 from splatseg.core import Capture, Gaussians, PointCloud, View
 from splatseg.core.boundary import boundary
 from splatseg.core.checkpoints import Checkpoints, deferred_interrupts
-from splatseg.core.partition import Cells, cut_plan
+from splatseg.core.partition import Cells, Gap, cut_plan
 from splatseg.errors import InputError
 from splatseg.fit._objects import ObjectSupervision
 from splatseg.fit._options import FitOptions
@@ -140,8 +140,9 @@ def cut_capture(
             f"got {count}."
         )
     centres = torch.stack([view.camera.centre for view in views]).double()
-    cells = cut_plan(centres, count, up=capture.up)
-    of_view, of_point = _members(capture, points, views, cells, options=options, backend=backend)
+    sight = _Sight.of(capture, views, options=options, backend=backend)
+    cells = cut_plan(centres, count, up=capture.up, border=sight.border)
+    of_view, of_point = sight.members(cells, centres, points.points)
     counts = of_view.sum(dim=1)
     blocks: list[CaptureBlock] = []
     for i in range(count):
@@ -177,33 +178,81 @@ def _check_options(options: FitOptions) -> None:
         raise InputError("strategy: expected mcmc or classic with blocks, got fixed.")
 
 
-def _members(
-    capture: Capture,
-    cloud: PointCloud,
-    views: Sequence[View],
-    cells: Cells,
-    *,
-    options: FitOptions,
-    backend: str,
-) -> tuple[Bool[Tensor, "b v"], Bool[Tensor, "b p"]]:
-    """Which views and which start points each block has."""
-    points = cloud.points
-    told = torch.arange(0, len(points), max(1, math.ceil(len(points) / _POINTS)))
-    some = PointCloud(points=points[told])
-    shown = _opaque_points(replace(capture, views=tuple(views), points=some), options)
-    regions = cells.regions(points)
-    cell = cells.cell_of(points[told])
-    at = cells.cell_of(torch.stack([view.camera.centre for view in views]))
-    of_view = torch.zeros(len(cells), len(views), dtype=torch.bool)
-    for i, view in enumerate(views):
-        weights = _visibility(shown, view, backend)
-        shares = torch.zeros(len(cells)).index_add(0, cell, weights)
-        of_view[:, i] = shares >= _MIN_SHARE * shares.sum().clamp_min(1e-9)
-        of_view[at[i], i] = True
-        seen = told[weights >= _MIN_WEIGHT]
-        for block in torch.nonzero(of_view[:, i]).squeeze(1).tolist():
-            regions[block, seen] = True
-    return of_view, regions
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Sight:
+    """Which start points views see, one row a pair."""
+
+    count: int
+    """Of the views."""
+
+    views: Int[Tensor, "m"]
+    points: Int[Tensor, "m"]
+    weights: Float[Tensor, "m"]
+    """Pixels of the reduced view that the point fills."""
+
+    told: Int[Tensor, "p"]
+    """Rows of the start points that are asked about."""
+
+    places: Float[Tensor, "p 3"]
+    """Where these are, float64."""
+
+    @classmethod
+    def of(
+        cls, capture: Capture, views: Sequence[View], *, options: FitOptions, backend: str
+    ) -> "_Sight":
+        """What the views see of the capture's start points."""
+        points = torch.zeros(0, 3) if capture.points is None else capture.points.points
+        told = torch.arange(0, len(points), max(1, math.ceil(len(points) / _POINTS)))
+        some = replace(capture, views=tuple(views), points=PointCloud(points=points[told]))
+        shown = _opaque_points(some, options)
+        rows: list[Tensor] = []
+        weights: list[Tensor] = []
+        for view in views:
+            found = _visibility(shown, view, backend)
+            rows.append(torch.nonzero(found > 0).squeeze(1))
+            weights.append(found[rows[-1]])
+        numbers = torch.repeat_interleave(torch.tensor([len(row) for row in rows]))
+        return cls(
+            count=len(views),
+            views=numbers,
+            points=torch.cat(rows),
+            weights=torch.cat(weights),
+            told=told,
+            places=points[told].double(),
+        )
+
+    def border(self, gap: Gap) -> float:
+        """Where the least of what cameras see is on the other side: in a wall between rooms."""
+        side = torch.zeros(self.count).double()
+        side[gap.before], side[gap.behind] = -1.0, 1.0
+        mass = torch.zeros(len(self.places)).double()
+        mass.index_add_(0, self.points, self.weights.double() * side[self.views])
+        along = self.places @ gap.direction
+        inside = torch.nonzero((along > gap.first) & (along < gap.last)).squeeze(1)
+        inside = inside[along[inside].argsort(stable=True)]
+        ends = along[inside]
+        ends = torch.cat((ends.new_tensor([gap.first]), ends, ends.new_tensor([gap.last])))
+        middles = (ends[1:] + ends[:-1]) / 2
+        misplaced = torch.cat((mass.new_zeros(1), mass[inside].cumsum(0)))
+        best = misplaced <= misplaced.min() + 1e-9 * float(mass.abs().sum())
+        off = (middles - (gap.first + gap.last) / 2).abs()
+        return float(middles[int(torch.where(best, off, math.inf).argmin())])
+
+    def members(
+        self, cells: Cells, centres: Float[Tensor, "v 3"], points: Float[Tensor, "n 3"]
+    ) -> tuple[Bool[Tensor, "b v"], Bool[Tensor, "b n"]]:
+        """Which views and which start points each block has."""
+        shares = torch.zeros(len(centres), len(cells))
+        cell = cells.cell_of(self.places)[self.points]
+        shares.index_put_((self.views, cell), self.weights, accumulate=True)
+        of_view = (shares >= _MIN_SHARE * shares.sum(dim=1, keepdim=True).clamp_min(1e-9)).T
+        of_view[cells.cell_of(centres), torch.arange(len(centres))] = True
+        of_point = cells.regions(points)
+        clear = self.weights >= _MIN_WEIGHT
+        for block, own in enumerate(of_view):
+            seen = self.points[clear & own[self.views]]
+            of_point[block, self.told[seen]] = True
+        return of_view, of_point
 
 
 def _opaque_points(capture: Capture, options: FitOptions) -> Gaussians:
@@ -318,13 +367,11 @@ def fit_blocks(
         objects=objects,
     )
     results: list[FitResult] = []
-    with deferred_interrupts() as interrupts:
+    with deferred_interrupts():
         for result in (fit_block(shared, block) for block in cut.blocks):
-            unfinished = len(results) + 1 < len(cut)
-            if result.interrupted or (interrupts.requested and unfinished):
-                fitted = len(results) + (not result.interrupted)
+            if result.interrupted:
                 onwards = "" if checkpoints is None else "; `resume` goes on from there"
-                raise KeyboardInterrupt(f"{fitted} of {len(cut)} blocks are fitted{onwards}")
+                raise KeyboardInterrupt(f"{len(results)} of {len(cut)} blocks are fitted{onwards}")
             results.append(result)
     return join_blocks(cut, results)
 
