@@ -2,7 +2,8 @@
 
 The plan of the training cameras, seen along the capture's up axis, is halved again and again
 between cameras, so that cells have equally many (VastGaussian, Lin et al. 2024, section 4.1;
-CityGaussian, Liu et al. 2024). The outermost cells have no end: each point is in one cell.
+CityGaussian, Liu et al. 2024), and there where least is seen from the other side, in a wall. The
+outermost cells have no end: each point is in one cell.
 
 A block is more than its cell. Its views are those that stand in its cell, which know that the
 air in it is empty, and those that show enough of it. What they show is told by the blending
