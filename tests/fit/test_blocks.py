@@ -253,6 +253,26 @@ def same(one: Gaussians, other: Gaussians) -> bool:
     return all(torch.equal(getattr(one, name), getattr(other, name)) for name in tensors)
 
 
+def test_a_block_corrects_the_bias_of_the_steps_of_the_whole(capture: Capture):
+    """The first step of Adam goes as far as the rate; counted as a later one, it goes farther."""
+    first = replace(SHORT, steps=1, strategy="classic", start="points", prune_floaters=False)
+    start = capture.points.points
+    moved = [
+        fit(capture, options=replace(first, bias_correction_steps=steps)).gaussians.means - start
+        for steps in (1.0, 3.0)
+    ]
+    seen = moved[0].abs() > 1e-6
+    assert int(seen.sum()) > 20
+    # m / (1 - 0.9^t) over the root of v / (1 - 0.999^t), at t = 3 and t = 1.
+    ratio = (0.1 / (1 - 0.9**3)) / (0.001 / (1 - 0.999**3)) ** 0.5
+    torch.testing.assert_close(
+        moved[1][seen] / moved[0][seen],
+        torch.tensor(ratio).expand(int(seen.sum())),
+        rtol=0.02,
+        atol=0,
+    )
+
+
 def test_one_block_is_a_fit(capture: Capture):
     whole = fit(capture, options=SHORT)
     blocks = fit_blocks(cut_capture(capture, 1, options=SHORT))

@@ -1,5 +1,6 @@
 """Work that was stopped, fits and trainings: where its state is kept, and whether it goes on."""
 
+import re
 import shutil
 from collections.abc import Generator
 from contextlib import contextmanager, suppress
@@ -24,6 +25,8 @@ from splatseg.io.scene_folder import (
 from splatseg.lift.training import training_summary
 from splatseg.methods import Method
 from splatseg.tasks.work import REPORTS_FOLDER, Observer, Work, check_replaceable_scene
+
+_BLOCK = re.compile(r"[0-9]{4,9}-of-0*[1-9][0-9]{0,8}")
 
 
 @options
@@ -109,7 +112,8 @@ def where_fit_stopped(root: Path) -> str | None:
 
 def block_files(root: Path) -> tuple[Path, ...]:
     """Checkpoints of the blocks of a fit, in their order."""
-    return tuple(sorted((root / BLOCKS_FOLDER).glob("*-of-*.npz")))
+    found = (root / BLOCKS_FOLDER).glob("*-of-*.npz")
+    return tuple(sorted(file for file in found if _BLOCK.fullmatch(file.stem)))
 
 
 def where_blocks_stopped(root: Path) -> str | None:
@@ -140,8 +144,7 @@ def discard_fit_files(root: Path, *, keep_checkpoint: bool = False) -> None:
 def blocks_progress(root: Path) -> tuple[int, float]:
     """How many blocks a fit has, and how many are fitted, parts of blocks included."""
     files = block_files(root)
-    counts = [file.stem.partition("-of-")[2] for file in files]
-    count = max((int(n) for n in counts if n.isdecimal()), default=0)
+    count = max((int(file.stem.partition("-of-")[2]) for file in files), default=0)
     progress = 0.0
     for file in files:
         with suppress(FileFormatError):  # a damaged one is named when it is resumed from
