@@ -455,7 +455,7 @@ def special(world: World, by_type: dict[type, Any]) -> dict[str, Any]:
 def inner(world: World, by_type: dict[type, Any]) -> dict[str, Any]:
     """Of functions whose arguments other functions of ours make."""
     from splatseg.evaluate import BoundaryCounts, Detections
-    from splatseg.fit import FitOptions
+    from splatseg.fit import FitOptions, cut_capture
     from splatseg.io.export import objects_of
     from splatseg.lift import EvidenceSegments, UpliftOptions, uplift
     from splatseg.lift.training import AdamConstants, LabelTargets
@@ -536,6 +536,11 @@ def inner(world: World, by_type: dict[type, Any]) -> dict[str, Any]:
         "edit.ids_named.names": ("one",),
         "edit.ids_named.classes": by_type[core.ClassTable],
         "fit.random_point_count.options": FitOptions(),
+        "fit.fit_blocks.cut": cut_capture(
+            replace(by_type[core.Capture], points=by_type[core.PointCloud]),
+            1,
+            options=FitOptions(minutes=None, steps=1, max_gaussians=9),
+        ),
         "fit.Refinement.options": FitOptions(),
         "fit.exposures_record.exposures": {},
         "edit.refit.provenance": {},

@@ -166,6 +166,7 @@ def _facts(made: MadeScene) -> dict[str, Any]:
         "test_views": len(made.capture.test_views),
         "held_out_views": made.held_out,
         **({} if made.moving is None else {"moving": made.moving.record}),
+        **({} if made.blocks is None else {"blocks": len(made.blocks)}),
         "scored_views": 0 if scores is None else len(scores.views),
         "psnr": None if scores is None else scores.psnr,
         "ssim": None if scores is None else scores.ssim,

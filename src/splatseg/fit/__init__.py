@@ -28,6 +28,12 @@ from splatseg.fit._run import fit as fit
 from splatseg.fit._start import random_point_count as random_point_count
 from splatseg.fit._step import ExtraLoss as ExtraLoss
 from splatseg.fit._views import Exposure as Exposure
+from splatseg.fit.blocks import BlockCount as BlockCount
+from splatseg.fit.blocks import CaptureBlock as CaptureBlock
+from splatseg.fit.blocks import CaptureBlocks as CaptureBlocks
+from splatseg.fit.blocks import Cells as Cells
+from splatseg.fit.blocks import cut_capture as cut_capture
+from splatseg.fit.blocks import fit_blocks as fit_blocks
 from splatseg.fit.depth import SCAN_SPACING as SCAN_SPACING
 from splatseg.fit.depth import DepthPoints as DepthPoints
 from splatseg.fit.depth import aligned_inverse as aligned_inverse

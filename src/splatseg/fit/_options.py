@@ -247,6 +247,10 @@ class FitOptions:
     """classic: minimum mean view-space gradient, per half image side, for a Gaussian to be cloned
     or split."""
 
+    bias_correction_steps: Positive = 1.0
+    """Steps that one counts as in Adam's bias correction. It is above 1 for a block of a larger
+    fit, where its Gaussians would be seen as much more rarely, and move farther each time."""
+
     reset_every: Count = 3000
     """classic: steps between two resets of the opacities. Opacities take hundreds of steps to grow
     again, so short fits have no reset."""

@@ -410,7 +410,7 @@ class FitRun:
         unit = _REFERENCE_SIZE / self._size
         settings = UpdateSettings(
             rates=rates,
-            step=self.steps + 1,
+            step=round((self.steps + 1) * self._options.bias_correction_steps),
             opacity_penalty=self._options.opacity_penalty / count,
             scale_penalty=self._options.scale_penalty * unit / (3 * count),
             noise=self._options.noise * rates.means * unit**2,

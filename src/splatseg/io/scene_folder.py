@@ -185,6 +185,9 @@ SCENE_FILE = "scene.json"
 GAUSSIANS_FILE = "gaussians.ply"
 CAMERAS_FILE = "cameras/transforms.json"
 CHECKPOINT_FILE = "fit/checkpoint.npz"
+BLOCKS_FOLDER = "fit/blocks"
+"""Where a fit in blocks keeps the checkpoint of each."""
+
 TRAINING_FOLDER = "training"
 """Where methods that train keep their state until the layer is written."""
 
@@ -215,13 +218,13 @@ def is_scene(path: Path) -> bool:
 @boundary
 def is_unfinished(path: Path) -> bool:
     """Whether a folder holds a fit that has not become a scene yet, and nothing else."""
-    checkpoint, poses = path / CHECKPOINT_FILE, path / POSES_FOLDER
+    checkpoint, poses, blocks = (path / n for n in (CHECKPOINT_FILE, POSES_FOLDER, BLOCKS_FOLDER))
     if is_scene(path) or not (checkpoint.parent.is_dir() or poses.is_dir()):
         return False
     own = (checkpoint.parent.name, poses.name, GAUSSIANS_FILE, MASKS_FOLDER, *FOLDERS)
     return (
         _holds_only(path, own)
-        and _holds_only(checkpoint.parent, (checkpoint.name, f"{checkpoint.name}.new"))
+        and _holds_only(checkpoint.parent, (checkpoint.name, f"{checkpoint.name}.new", blocks.name))
         and _holds_only(poses, _POSES_ENTRIES)
     )
 

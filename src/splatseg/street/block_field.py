@@ -25,11 +25,12 @@ from splatseg.core import (
     View,
 )
 from splatseg.core.boundary import boundary
+from splatseg.core.partition import BlockShare
 from splatseg.core.scans import Scan
 from splatseg.errors import InputError, RangeError
 from splatseg.io.arrays import read_npy
 from splatseg.io.atomic import named_write_failures
-from splatseg.street.blocks import BlockShare, DriveBlock, DriveBlocks
+from splatseg.street.blocks import DriveBlock, DriveBlocks
 
 
 @runtime_checkable

@@ -1,30 +1,25 @@
-r"""A drive cut into overlapping blocks, and what each block counts at a point.
+"""A drive cut into overlapping blocks.
 
-The line of the drive is cut into consecutive pieces of equal length. With :math:`\\delta_b(x)` the
-distance of a point from the piece of block b, and o the overlap, blocks count
-
-.. math:: w_b(x) = \frac{g_b(x)}{\\sum_c g_c(x)}, \\qquad
-          g_b(x) = \\operatorname{clip}\\left(\frac12 + \frac{\\min_{c \ne b} \\delta_c(x)
-                   - \\delta_b(x)}{o},\\; 0,\\; 1\right)
-
-On the line of the drive that goes linearly from 1 to 0 over the overlap around the end of a piece.
-It is a function of the point alone and continuous everywhere, inside of bends and where a drive
-crosses itself as well: there the blocks of all passes count.
+The line of the drive is cut into consecutive pieces of equal length, which are the cores of its
+blocks. What each counts at a point is in `core.partition`: on the line of the drive it goes
+linearly from 1 to 0 over the overlap around the end of a piece; inside of bends and where a drive
+crosses itself the blocks of all passes count.
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from splatseg._check import check_finite, check_shape
 from splatseg.core import View
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.options import Positive, options
+from splatseg.core.partition import BlockShare, block_shares, owners
 from splatseg.core.scene import frame_number
 from splatseg.errors import InputError, RangeError
 
@@ -94,19 +89,6 @@ class DriveBlock:
             raise RangeError(f"start, end: expected a piece, got {self.start:g} to {self.end:g}.")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class BlockShare:
-    """What a block counts at some points."""
-
-    block: int
-
-    rows: Int[Tensor, "n"]
-    """Which points, int64, ascending."""
-
-    weights: Float[Tensor, "n"]
-    """In (0, 1], float64; those of all blocks at a point add up to 1."""
-
-
 def _no_places() -> Float[Tensor, "0 3"]:
     return torch.zeros(0, 3, dtype=torch.float64)
 
@@ -164,28 +146,19 @@ class DriveBlocks:
         """
         check_shape("points", points, (None, 3))
         check_finite("points", points)
-        at = points.detach().cpu().double()
-        found: dict[int, list[tuple[Tensor, Tensor]]] = {}
-        for first in range(0, len(at), _POINTS):
-            for block, weights in self._weights(at[first : first + _POINTS]):
-                rows = torch.nonzero(weights > 0).squeeze(1)
-                if len(rows):
-                    found.setdefault(block, []).append((rows + first, weights[rows]))
-        return tuple(
-            BlockShare(
-                block=block,
-                rows=torch.cat([rows for rows, _ in parts]),
-                weights=torch.cat([weights for _, weights in parts]),
-            )
-            for block, parts in sorted(found.items())
+        return block_shares(
+            points.detach().cpu().double(),
+            lambda places, block: distances(places, self.blocks[block].piece),
+            low=self._low,
+            high=self._high,
+            overlap=self.overlap,
         )
 
     @boundary
     def block_of(self, place: Float[Tensor, "3"]) -> int:
         """The block that counts most at a place, such as a camera's; of equal ones the first."""
         check_shape("place", place, (3,))
-        shares = self.shares(place.unsqueeze(0))
-        return max(shares, key=lambda share: (float(share.weights[0]), -share.block)).block
+        return int(owners(self.shares(place.unsqueeze(0)), 1))
 
     @boundary
     def counts(self, block: DriveBlock, points: Float[Tensor, "p 3"]) -> Bool[Tensor, "p"]:
@@ -215,31 +188,6 @@ class DriveBlocks:
         if len(self) == 1:
             return torch.ones(len(points), dtype=torch.bool)
         return distances(points.detach().cpu().double(), block.span) <= self.reach
-
-    def _weights(self, points: Float[Tensor, "n 3"]) -> Iterator[tuple[int, Float[Tensor, "n"]]]:
-        """Blocks that may count at some points, with their weights there."""
-        gaps = torch.maximum(self._low - points.amax(dim=0), points.amin(dim=0) - self._high)
-        gaps = torch.linalg.vector_norm(gaps.clamp_min(0), dim=1)
-        nearest = points.new_full((len(points),), math.inf)
-        found: dict[int, Tensor] = {}
-        for block in torch.argsort(gaps, stable=True).tolist():
-            # A block that is half an overlap farther than another from all points counts nothing.
-            if float(gaps[block]) > float(nearest.max()) + self.overlap / 2:
-                break
-            found[block] = distances(points, self.blocks[block].piece)
-            nearest = torch.minimum(nearest, found[block])
-        # In the order of blocks, so that sums do not depend on which points are asked together.
-        order = sorted(found)
-        table = torch.stack([found[block] for block in order])
-        two = table.topk(min(2, len(order)), dim=0, largest=False).values
-        second = two[1] if len(order) > 1 else torch.full_like(nearest, math.inf)
-        others = torch.where(table == nearest, second, nearest)
-        counts = (0.5 + (others - table) / self.overlap).clamp(0, 1)
-        total = counts[0].clone()
-        for row in counts[1:]:
-            total += row
-        for block, row in zip(order, counts, strict=True):
-            yield block, row / total
 
 
 @boundary

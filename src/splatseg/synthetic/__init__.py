@@ -1,6 +1,7 @@
 """Generated scenes with exact truth, for the demo and for tests."""
 
 from splatseg.synthetic.builder import ROOM_CLASSES as ROOM_CLASSES
+from splatseg.synthetic.building import building as building
 from splatseg.synthetic.capture import write_capture as write_capture
 from splatseg.synthetic.furnishing import room as room
 from splatseg.synthetic.photographs import cameras as cameras

@@ -2,7 +2,8 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -16,7 +17,7 @@ from splatseg.core.boundary import boundary
 from splatseg.core.evidence import UNLABELLED
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.synthetic.raycast import Truth
-from splatseg.synthetic.solids import SyntheticScene
+from splatseg.synthetic.solids import SyntheticScene, Vector
 
 _CLEARANCE = 0.28
 _LOOKS = ("across", "across", "near", "across", "across", "up")
@@ -87,7 +88,8 @@ def cameras(
 
     They stand on a ring half-way to the walls at changing heights. Most look across the
     room, one of six at what is near and one up to the ceiling. Test views stand between train
-    views. The same scene gives the same views.
+    views. Of a scene of several rooms each has its share of the views, one room after the
+    other. The same scene gives the same views.
 
     Returns:
         Views named ``train_0000`` ... and ``test_0000`` ..., without photographs.
@@ -99,13 +101,28 @@ def cameras(
     check_range("test", test, 0, 10000)
     rng = np.random.default_rng([scene.seed, 7])
     views: list[View] = []
-    for split, count, phase in (("train", train, 0.0), ("test", test, 0.5)):
-        for i in range(count):
-            turn = 2 * math.pi * (i + phase) / count
-            eye, target = _stand(scene, rng, turn=turn, look=_LOOKS[i % len(_LOOKS)])
-            camera = look_at(eye, target, width=width, height=height, field_of_view=field_of_view)
-            views.append(View(name=f"{split}_{i:04d}", camera=camera, split=split))
+    rooms = [_room_of(scene, *box) for box in scene.rooms] or [scene]
+    for split, total, phase in (("train", train, 0.0), ("test", test, 0.5)):
+        ends = [total * i // len(rooms) for i in range(len(rooms) + 1)]
+        for own, (first, last) in zip(rooms, pairwise(ends), strict=True):
+            for i in range(last - first):
+                turn = 2 * math.pi * (i + phase) / (last - first)
+                eye, target = _stand(own, rng, turn=turn, look=_LOOKS[i % len(_LOOKS)])
+                camera = look_at(
+                    eye, target, width=width, height=height, field_of_view=field_of_view
+                )
+                views.append(View(name=f"{split}_{first + i:04d}", camera=camera, split=split))
     return tuple(views)
+
+
+def _room_of(scene: SyntheticScene, low: Vector, high: Vector) -> SyntheticScene:
+    """One room of a scene, with the solids that stand in it."""
+    inside = tuple(
+        solid
+        for solid in scene.primitives
+        if all(low[k] - solid.radius < solid.centre[k] < high[k] + solid.radius for k in range(3))
+    )
+    return replace(scene, primitives=inside, bounds=(low, high), rooms=())
 
 
 def _stand(

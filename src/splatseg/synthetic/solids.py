@@ -262,6 +262,10 @@ class SyntheticScene:
     is_outdoor: bool = False
     """Whether there is a sky instead of walls around `bounds`: the sun shines everywhere."""
 
+    rooms: tuple[tuple[Vector, Vector], ...] = ()
+    """Lowest and highest corners of its rooms, of each of which cameras take their share; none
+    where `bounds` is the only one."""
+
     drive: tuple[Vector, ...] = ()
     """Corners of a line on the ground that a vehicle with cameras follows; none in a room."""
 

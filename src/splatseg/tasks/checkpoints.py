@@ -1,5 +1,6 @@
 """Work that was stopped, fits and trainings: where its state is kept, and whether it goes on."""
 
+import re
 import shutil
 from collections.abc import Generator
 from contextlib import contextmanager, suppress
@@ -11,8 +12,10 @@ from splatseg.core.checkpoints import Checkpoints
 from splatseg.core.options import Count, Positive, options
 from splatseg.errors import FileFormatError, InputError, SplatsegError
 from splatseg.fit import CheckpointSummary, CheckpointVersionError, checkpoint_summary
+from splatseg.io.arrays import discard_checkpoint_file
 from splatseg.io.atomic import named_write_failures
 from splatseg.io.scene_folder import (
+    BLOCKS_FOLDER,
     CHECKPOINT_FILE,
     MASKS_FOLDER,
     is_scene,
@@ -22,6 +25,8 @@ from splatseg.io.scene_folder import (
 from splatseg.lift.training import training_summary
 from splatseg.methods import Method
 from splatseg.tasks.work import REPORTS_FOLDER, Observer, Work, check_replaceable_scene
+
+_BLOCK = re.compile(r"[0-9]{4,9}-of-0*[1-9][0-9]{0,8}")
 
 
 @options
@@ -69,31 +74,82 @@ class CheckpointOptions:
         )
 
 
-def check_fit_output(root: Path, options: CheckpointOptions) -> str | None:
+def check_fit_output(
+    root: Path, options: CheckpointOptions, *, in_blocks: bool = False
+) -> str | None:
     """Refuse before a fit what could not be written after it.
 
     Args:
         root: The scene folder to be.
         options: Whether a fit that was stopped there is to go on, or may be lost.
+        in_blocks: Whether the fit is in blocks.
 
     Returns:
         A sentence on where the fit goes on, None where it begins.
     """
     options.check_not_both()
     check_replaceable_scene(root, unfinished=True)
-    checkpoint = root / CHECKPOINT_FILE
     if options.resume:
-        return _resumed(root, checkpoint)
-    if checkpoint.is_file() and not options.overwrite:
-        stopped = where_it_stopped(checkpoint)
-        if stopped is not None:
-            resumable = stopped.startswith("was stopped at")
-            hint = "`resume` continues it, " if resumable else ""
-            raise InputError(
-                f"{root}: expected a new folder, got a fit that {stopped}; {hint}`overwrite` "
-                "begins again."
-            )
+        return _resumed(root, in_blocks=in_blocks)
+    stopped = where_fit_stopped(root)
+    if stopped is not None and not options.overwrite:
+        resumable = stopped.startswith("was stopped at")
+        hint = "`resume` continues it, " if resumable else ""
+        raise InputError(
+            f"{root}: expected a new folder, got a fit that {stopped}; {hint}`overwrite` "
+            "begins again."
+        )
     return None
+
+
+def where_fit_stopped(root: Path) -> str | None:
+    """Where the fit of a folder was stopped, in words; None if none was, or it was finished."""
+    if block_files(root):
+        return where_blocks_stopped(root)
+    checkpoint = root / CHECKPOINT_FILE
+    return where_it_stopped(checkpoint) if checkpoint.is_file() else None
+
+
+def block_files(root: Path) -> tuple[Path, ...]:
+    """Checkpoints of the blocks of a fit, in their order."""
+    found = (root / BLOCKS_FOLDER).glob("*-of-*.npz")
+    return tuple(sorted(file for file in found if _BLOCK.fullmatch(file.stem)))
+
+
+def where_blocks_stopped(root: Path) -> str | None:
+    """Where a fit in blocks was stopped, in words; None if all are finished."""
+    count, progress = blocks_progress(root)
+    if progress >= count:
+        return None
+    done = 100 * progress / count
+    return f"was stopped at block {int(progress) + 1} of {count} ({done:.0f} %)"
+
+
+def check_block_count(root: Path, count: int) -> None:
+    """Refuse to go on with a fit of another number of blocks."""
+    known, _ = blocks_progress(root)
+    if known not in (0, count):
+        raise InputError(
+            f"{root}: expected `blocks` {known}, as the fit that is to go on has, got {count}."
+        )
+
+
+def discard_fit_files(root: Path, *, keep_checkpoint: bool = False) -> None:
+    """Remove the checkpoints of a fit and of its blocks, and their folder if it is empty then."""
+    shutil.rmtree(root / BLOCKS_FOLDER, ignore_errors=True)
+    if not keep_checkpoint:
+        discard_checkpoint_file(root / CHECKPOINT_FILE)
+
+
+def blocks_progress(root: Path) -> tuple[int, float]:
+    """How many blocks a fit has, and how many are fitted, parts of blocks included."""
+    files = block_files(root)
+    count = max((int(file.stem.partition("-of-")[2]) for file in files), default=0)
+    progress = 0.0
+    for file in files:
+        with suppress(FileFormatError):  # a damaged one is named when it is resumed from
+            progress += min(1.0, checkpoint_summary(file).progress)
+    return count, progress
 
 
 @contextmanager
@@ -109,10 +165,10 @@ def fit_folder(root: Path) -> Generator[None]:
                 checkpoints.mkdir(exist_ok=True)
             yield
     finally:
-        if not is_scene(root) and not (root / CHECKPOINT_FILE).is_file():
+        if not is_scene(root) and not (root / CHECKPOINT_FILE).is_file() and not block_files(root):
             # Nothing goes on from here that could want them.
             shutil.rmtree(root / MASKS_FOLDER, ignore_errors=True)
-        for folder in (checkpoints, root):
+        for folder in (root / BLOCKS_FOLDER, checkpoints, root):
             with suppress(OSError):  # it is not empty
                 folder.rmdir()
 
@@ -128,8 +184,20 @@ def where_it_stopped(checkpoint: Path) -> str | None:
     return None if summary.progress >= 1 else f"was stopped at {_fit_step(summary)}"
 
 
-def _resumed(root: Path, checkpoint: Path) -> str | None:
+def _resumed(root: Path, *, in_blocks: bool) -> str | None:
+    checkpoint = root / CHECKPOINT_FILE
+    if block_files(root):
+        count, progress = blocks_progress(root)
+        if not in_blocks:
+            raise InputError(
+                f"{root}: expected `blocks` {count}, as the fit that is to go on has, got none."
+            )
+        return f"{root}: going on, {int(progress)} of {count} blocks are fitted"
     if checkpoint.is_file():
+        if in_blocks:
+            raise InputError(
+                f"{root}: expected no `blocks`, as the fit that is to go on has none, got some."
+            )
         return f"{root}: going on from {_fit_step(checkpoint_summary(checkpoint))}"
     if is_scene(root):
         raise InputError(

@@ -42,7 +42,12 @@ from splatseg.io.scene_folder import (
     training_files,
 )
 from splatseg.io.splats import SplatWarning, Values, read_splats, splat_format, trained_splats
-from splatseg.tasks.checkpoints import where_it_stopped, where_training_stopped
+from splatseg.tasks.checkpoints import (
+    block_files,
+    blocks_progress,
+    where_fit_stopped,
+    where_training_stopped,
+)
 
 _LAYOUTS = ("auto", *FORMATS)
 _CAPTURE_FILES = (
@@ -131,7 +136,17 @@ def _unfinished_facts(path: Path) -> dict[str, Any]:
     checkpoint = path / CHECKPOINT_FILE
     facts: dict[str, Any] = {"path": str(path), "kind": "unfinished fit", "running": _running(path)}
     summary = CheckpointSummary(steps=0, progress=0.0, seconds=0.0, gaussians=0)
-    if checkpoint.is_file():
+    if files := block_files(path):
+        count, progress = blocks_progress(path)
+        parts = [checkpoint_summary(file) for file in files]
+        summary = CheckpointSummary(
+            steps=sum(part.steps for part in parts),
+            progress=progress / count,
+            seconds=sum(part.seconds for part in parts),
+            gaussians=sum(part.gaussians for part in parts),
+        )
+        facts["blocks"] = count
+    elif checkpoint.is_file():
         summary = checkpoint_summary(checkpoint)
     return facts | asdict(summary)
 
@@ -219,10 +234,9 @@ def _scene_facts(scene: Scene) -> dict[str, Any]:
 def _stopped_notes(root: Path) -> list[str]:
     """What was stopped in a scene folder and can go on."""
     notes: list[str] = []
-    if (root / CHECKPOINT_FILE).is_file():
-        stopped = where_it_stopped(root / CHECKPOINT_FILE)
-        if stopped is not None:
-            notes.append(f"its fit {stopped}; fit --resume continues it")
+    stopped = where_fit_stopped(root)
+    if stopped is not None:
+        notes.append(f"its fit {stopped}; fit --resume continues it")
     notes += [
         f"the training of layer {file.stem} {where_training_stopped(file)}; segment --resume "
         "continues it"

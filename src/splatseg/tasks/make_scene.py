@@ -3,6 +3,7 @@
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,20 +15,24 @@ from splatseg.evaluate import PhotographReport, evaluate_photographs, render_and
 from splatseg.evaluate.photographs import MaskUse
 from splatseg.fit import (
     EXPOSURES,
+    CaptureBlocks,
     FitOptions,
-    FitProgress,
     FitResult,
     exposures_record,
-    fit,
     random_point_count,
     reduction_note,
 )
-from splatseg.io.arrays import discard_checkpoint_file
 from splatseg.io.captures import read_start_points
 from splatseg.io.scans import read_scans
 from splatseg.io.scene import save_scene
-from splatseg.io.scene_folder import CHECKPOINT_FILE, GAUSSIANS_FILE, POSES_FOLDER, scene_path
-from splatseg.lift import GaussianField, ObjectLabels
+from splatseg.io.scene_folder import (
+    BLOCKS_FOLDER,
+    CHECKPOINT_FILE,
+    GAUSSIANS_FILE,
+    POSES_FOLDER,
+    scene_path,
+)
+from splatseg.lift import GaussianField
 from splatseg.pose import PoseReport, load_pose_report
 from splatseg.pose.pointmaps import PointmapReport
 from splatseg.render import BackendName
@@ -35,7 +40,13 @@ from splatseg.report.fit_report import FitReportData, FitVerdict, fit_record, fi
 from splatseg.report.images import Gallery, GalleryImage, colour_difference
 from splatseg.report.maps import camera_map
 from splatseg.tasks.add_photographs import add_photographs
-from splatseg.tasks.checkpoints import check_fit_output, fit_folder
+from splatseg.tasks.checkpoints import (
+    check_block_count,
+    check_fit_output,
+    discard_fit_files,
+    fit_folder,
+)
+from splatseg.tasks.fit_blocks import FitSteps, ObjectsOf, fitted, in_cells
 from splatseg.tasks.fit_objects import object_labels
 from splatseg.tasks.moving import (
     LeftOut,
@@ -48,7 +59,6 @@ from splatseg.tasks.work import (
     REPORTS_FOLDER,
     SILENT,
     Observer,
-    Step,
     scene_of_capture,
     versions,
     write_page,
@@ -84,6 +94,9 @@ class MadeScene:
 
     verdict: FitVerdict
     """What the fit is good for."""
+
+    blocks: CaptureBlocks | None
+    """How the capture was cut; None where it was fitted as a whole."""
 
     timings: Mapping[str, float]
     """Seconds by part: photographs and poses, optimisation, what follows it."""
@@ -136,18 +149,33 @@ def fit_capture(
             command=command,
             observer=observer,
         )
-    onwards = check_fit_output(folder, options)
+    in_blocks = options.blocks != "off"
+    onwards = check_fit_output(folder, options, in_blocks=in_blocks)
     with fit_folder(folder):
         began = time.monotonic()
         capture, poses, moving = _capture(data, folder, options, fit_options, observer)
-        objects: ObjectLabels | None = None
+        objects: ObjectsOf | None = None
         if options.evidence is not None:
-            objects = object_labels(
-                capture, options.evidence, scene=folder, options=fit_options, backend=backend
+            objects = partial(
+                object_labels,
+                asked=options.evidence,
+                scene=folder,
+                options=fit_options,
+                backend=backend,
             )
+            whole = objects(capture)
+            objects = objects if in_blocks else lambda _: whole
+        if not options.resume:  # what is there of an earlier fit in blocks was to be replaced
+            discard_fit_files(folder, keep_checkpoint=True)
+        cut = None
+        if options.blocks != "off":
+            cut = in_cells(
+                capture, options.blocks, options=fit_options, backend=backend, observer=observer
+            )
+            check_block_count(folder, len(cut))
         timings = {"photographs and poses": time.monotonic() - began}
         checkpoints = options.checkpoints(
-            folder / CHECKPOINT_FILE,
+            folder / (CHECKPOINT_FILE if cut is None else BLOCKS_FOLDER),
             at_end=options.keep_checkpoint,
             observer=observer,
             onwards=onwards,
@@ -156,11 +184,11 @@ def fit_capture(
             observer.info(f"{folder}: nothing to go on from, beginning")
         began = time.monotonic()
         result, stopped = _fitted(
-            capture,
+            capture if cut is None else cut,
             folder,
             fit_options,
             checkpoints,
-            record=_record(options, moving),
+            record=_record(options, moving) | ({} if cut is None else {"blocks": cut.record()}),
             objects=objects,
             backend=backend,
             observer=observer,
@@ -181,7 +209,7 @@ def fit_capture(
         )
         # Not before the report: who is stopped there can resume, and gets it.
         if not (stopped or options.keep_checkpoint):
-            discard_checkpoint_file(folder / CHECKPOINT_FILE)
+            discard_fit_files(folder)
     verdict = verdict_of(told)
     if verdict.warns:
         observer.note(f"{verdict.words.lower()}: {verdict.sentence.rstrip('.')}")
@@ -196,6 +224,7 @@ def fit_capture(
         poses=poses,
         moving=moving,
         verdict=verdict,
+        blocks=cut,
         timings=told.timings,
     )
 
@@ -258,6 +287,7 @@ def _with_more(
         report=report,
         poses=None,
         moving=None,
+        blocks=None,
         verdict=verdict_of(told),
         timings=told.timings,
     )
@@ -325,62 +355,34 @@ def _capture(
 
 
 def _fitted(
-    capture: Capture,
+    data: Capture | CaptureBlocks,
     folder: Path,
     fit_options: FitOptions,
     checkpoints: Checkpoints,
     *,
     record: Mapping[str, Any],
-    objects: ObjectLabels | None,
+    objects: ObjectsOf | None,
     backend: BackendName,
     observer: Observer,
 ) -> tuple[FitResult, bool]:
     """Fit and write the scene. Tells whether it was asked to stop, while it wrote too."""
     with deferred_interrupts() as interrupts:
         with observer.stage("fit") as step:
-            result = fit(
-                capture,
+            result = fitted(
+                data,
                 options=fit_options,
                 backend=backend,
                 progress=FitSteps(step),
                 checkpoints=checkpoints,
                 objects=objects,
             )
+        capture = data if isinstance(data, Capture) else data.capture
         provenance = _provenance(record, fit_options, backend, result)
         scene = scene_of_capture(
             capture, result.gaussians, views=result.views, provenance=provenance
         )
         save_scene(scene, folder)
     return result, interrupts.requested or result.interrupted
-
-
-# Weight of the newest view in the figures that are told; views differ much.
-_SMOOTHING = 0.02
-
-
-class FitSteps:
-    """Tells of the steps of a fit, with loss and PSNR smoothed over many views.
-
-    Args:
-        step: Is told.
-    """
-
-    def __init__(self, step: Step) -> None:
-        self._step = step
-        self._smoothed: tuple[float, float] | None = None
-
-    def __call__(self, now: FitProgress) -> None:
-        """Of one step."""
-        loss, psnr = self._smoothed or (now.loss, now.psnr)
-        loss += _SMOOTHING * (now.loss - loss)
-        psnr += _SMOOTHING * (now.psnr - psnr)
-        self._smoothed = loss, psnr
-        self._step(
-            round(1000 * now.progress),
-            1000,
-            f"step {now.step}, loss {loss:.4f}, PSNR {psnr:.2f}, {now.count} Gaussians, "
-            f"{now.step / max(now.seconds, 1e-9):.1f} it/s",
-        )
 
 
 def _beginning(capture: Capture, options: FitOptions) -> str:

@@ -87,6 +87,12 @@ class MakeSceneOptions(CheckpointOptions):
     """Keep the checkpoint of the finished fit, so that `resume` with more minutes or steps can make
     it longer."""
 
+    blocks: Literal["auto", "off"] | Count = "off"
+    """Fit in blocks, which need less memory and can be fitted on several machines: cells of the
+    plan with an overlap, each fitted to the views that see it, and joined. A number of blocks;
+    auto: one for 150 training views or a million Gaussians. They share the length and the largest
+    number of Gaussians."""
+
     depth_evidence: str | None = None
     """Evidence of depth, as see --what depth writes it, instead of the capture's depth maps: a
     folder, or its name in the capture or in a scene that is replaced."""
