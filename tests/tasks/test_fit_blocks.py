@@ -1,6 +1,7 @@
 """A scene fitted in blocks: what it remembers, how it is stopped and goes on, what is refused."""
 
 import json
+import pickle
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import torch
 from splatseg.cli import main
 from splatseg.errors import InputError
 from splatseg.fit import FitOptions
+from splatseg.fit.blocks import BlockFits
 from splatseg.io.captures import read_capture
 from splatseg.io.scene import load_scene
 from splatseg.io.scene_folder import BLOCKS_FOLDER, CHECKPOINT_FILE, is_scene, is_unfinished
@@ -168,3 +170,28 @@ def test_the_command_line(small_room, straight, tmp_path, capsys):
         assert main([*words, "-o", str(tmp_path / "wrong"), "--blocks", wrong]) == 2
         assert "blocks" in capsys.readouterr().err
         assert not (tmp_path / "wrong").exists()
+
+
+class Elsewhere:
+    """Sends what it is given as another process gets it, and works on it here."""
+
+    def __init__(self) -> None:
+        self.sent: list[BlockFits] = []
+
+    def map(self, function, items, *, shared):
+        self.sent.append(pickle.loads(pickle.dumps(shared)))
+        for item in items:
+            yield from function(self.sent[-1], pickle.loads(pickle.dumps(item)))
+
+
+def test_blocks_that_are_fitted_elsewhere_have_the_same_bytes(small_room, straight, tmp_path):
+    folder, executor, told = tmp_path / "scene", Elsewhere(), Stopping()
+    made_of(small_room, folder, executor=executor, observer=told)
+    assert gaussians(folder) == gaussians(straight)
+    (shared,) = executor.sent
+    assert shared.progress is None
+    assert shared.checkpoints is not None
+    assert shared.checkpoints.path == folder / BLOCKS_FOLDER
+    assert shared.checkpoints.steps == 5
+    assert shared.checkpoints.failed is not told.note
+    assert not (folder / "fit").exists()

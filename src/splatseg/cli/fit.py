@@ -20,6 +20,7 @@ from splatseg.errors import InputError
 from splatseg.fit import FitOptions, Preset, Strategy
 from splatseg.report.fit_report import scored_of
 from splatseg.tasks import ImportOptions, MadeScene, MakeSceneOptions, fit_capture, import_scene
+from splatseg.tasks.executors import ExecutorOptions, open_executor
 
 _DEFAULT = FitOptions()
 
@@ -108,18 +109,24 @@ class Command(Printing):
     )
     """How photographs are read, where cameras come from, and how a stopped fit goes on."""
 
+    executing: tyro.conf.OmitArgPrefixes[ExecutorOptions] = field(default_factory=ExecutorOptions)
+    """Where blocks are fitted (--blocks)."""
+
 
 def run(command: Command) -> None:
     """Fit a scene and write it."""
-    made = fit_capture(
-        command.data,
-        command.output,
-        options=command.capture,
-        fit_options=_options(command),
-        backend=command.backend,
-        command=typed(sys.argv),
-        observer=command.observer,
-    )
+    fit_options = _options(command)
+    with open_executor(command.executing, observer=command.observer) as executor:
+        made = fit_capture(
+            command.data,
+            command.output,
+            options=command.capture,
+            fit_options=fit_options,
+            backend=command.backend,
+            executor=executor,
+            command=typed(sys.argv),
+            observer=command.observer,
+        )
     print_result(_facts(made), _lines(made), json=command.json)
     if made.interrupted:
         raise KeyboardInterrupt

@@ -48,6 +48,11 @@ class Interrupts:
 _active: list[Interrupts] = []
 
 
+def interrupt_requested() -> bool:
+    """Whether signals are recorded now, and one has come: who waits for others ends by that."""
+    return bool(_active) and _active[-1].requested
+
+
 @contextmanager
 def deferred_interrupts() -> Generator[Interrupts]:
     """Record these signals while the block runs; the third raises `KeyboardInterrupt`.

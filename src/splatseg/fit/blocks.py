@@ -14,8 +14,9 @@ cell are kept.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -24,7 +25,7 @@ from jaxtyping import Bool, Float, Int
 from msgspec import Meta
 from torch import Tensor
 
-from splatseg.core import Capture, Gaussians, PointCloud, View
+from splatseg.core import LOCAL, Capture, Executor, Gaussians, PointCloud, View
 from splatseg.core.boundary import boundary
 from splatseg.core.checkpoints import Checkpoints, deferred_interrupts
 from splatseg.core.partition import Cells, Gap, cut_plan
@@ -299,6 +300,22 @@ class BlockFits:
     objects: Callable[[Capture], ObjectSupervision] | None = None
     """Gives the evidence of objects in the views of a block; None is none."""
 
+    def __reduce__(self) -> tuple[Callable[..., "BlockFits"], tuple[()]]:
+        """What another process gets: nobody there is told of steps."""
+        own = self.checkpoints
+        if own is not None:
+            own = Checkpoints(
+                path=own.path, seconds=own.seconds, steps=own.steps, resume=own.resume
+            )
+        again = partial(
+            BlockFits,
+            cells=self.cells,
+            backend=self.backend,
+            checkpoints=own,
+            objects=self.objects,
+        )
+        return again, ()
+
     def checkpoints_of(self, block: CaptureBlock) -> Checkpoints | None:
         """Of one block: its last one stays, as what was fitted."""
         if self.checkpoints is None:
@@ -335,23 +352,30 @@ def fit_block(shared: BlockFits, block: CaptureBlock) -> FitResult:
     return replace(result, gaussians=result.gaussians[own])
 
 
+def _fitted(shared: BlockFits, block: CaptureBlock) -> Generator[FitResult]:
+    yield fit_block(shared, block)
+
+
 @boundary
 def fit_blocks(
     cut: CaptureBlocks,
     *,
     backend: str = "auto",
+    executor: Executor = LOCAL,
     progress: Callable[[int, FitProgress], None] | None = None,
     checkpoints: Checkpoints | None = None,
     objects: Callable[[Capture], ObjectSupervision] | None = None,
 ) -> FitResult:
-    """Fit the blocks of a capture one after the other, and join them.
+    """Fit the blocks of a capture, and join them.
 
     With `FitOptions.steps` the result depends on the seed alone, however often it was stopped.
 
     Args:
         cut: The capture in blocks.
         backend: Name of the renderer.
-        progress: Called after every step with the number of the block.
+        executor: Where blocks are fitted.
+        progress: Called after every step with the number of the block, of blocks that are fitted
+            in this process.
         checkpoints: Where and how often blocks write checkpoints, its path a folder. A finished
             block leaves its last one, from which a resumed fit takes it. None writes none.
         objects: Gives the evidence of objects in the views of a block; None is none.
@@ -369,7 +393,7 @@ def fit_blocks(
     )
     results: list[FitResult] = []
     with deferred_interrupts():
-        for result in (fit_block(shared, block) for block in cut.blocks):
+        for result in executor.map(_fitted, cut.blocks, shared=shared):
             if result.interrupted:
                 onwards = "" if checkpoints is None else "; `resume` goes on from there"
                 raise KeyboardInterrupt(f"{len(results)} of {len(cut)} blocks are fitted{onwards}")

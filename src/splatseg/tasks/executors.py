@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splatseg.core import LOCAL, Executor
+from splatseg.core.checkpoints import interrupt_requested
 from splatseg.core.options import Count, NonNegative, options
 from splatseg.errors import BackendError, InputError, import_package, reason
 from splatseg.render.cpu import set_threads
@@ -47,6 +48,9 @@ _AHEAD = 2
 
 _SECONDS = 5.0
 """In which a cluster must answer."""
+
+_INTERRUPTED = 0.5
+"""Seconds after which who waits for a worker looks whether it was asked to stop."""
 
 _SETTINGS = bytes((0, 0, 0, 4, 0, 0, 0, 0, 0))
 """The frame by which either side of HTTP/2 begins: of length 0 and type 4."""
@@ -248,6 +252,9 @@ class RayExecutor:
     def _results(self, task: Any) -> list[Any]:
         """What an item yielded."""
         exceptions = self._ray.exceptions
+        while not self._ray.wait([task], timeout=_INTERRUPTED)[0]:
+            if interrupt_requested():
+                raise KeyboardInterrupt
         try:
             parts = self._ray.get(task)
         except exceptions.RayTaskError as error:

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
-from splatseg.core import Capture
+from splatseg.core import Capture, Executor
 from splatseg.core.checkpoints import Checkpoints
 from splatseg.fit import (
     BlockCount,
@@ -55,6 +55,7 @@ def fitted(
     progress: "FitSteps",
     checkpoints: Checkpoints,
     objects: ObjectsOf | None,
+    executor: Executor,
 ) -> FitResult:
     """Fit a capture as a whole, or the blocks of one.
 
@@ -65,6 +66,7 @@ def fitted(
         progress: Is told of every step.
         checkpoints: Of a whole its file, of blocks their folder.
         objects: Gives the evidence of objects; None is none.
+        executor: Where blocks are fitted.
 
     Raises:
         InputError: As `fit` and `fit_blocks`.
@@ -82,6 +84,7 @@ def fitted(
     return fit_blocks(
         data,
         backend=backend,
+        executor=executor,
         progress=partial(progress.of_block, count=len(data)),
         checkpoints=checkpoints,
         objects=objects,

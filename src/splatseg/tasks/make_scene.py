@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from splatseg.core import Capture, View
+from splatseg.core import LOCAL, Capture, Executor, View
 from splatseg.core.boundary import boundary
 from splatseg.core.checkpoints import Checkpoints, deferred_interrupts
 from splatseg.errors import InputError
@@ -110,6 +110,7 @@ def fit_capture(
     options: MakeSceneOptions | None = None,
     fit_options: FitOptions | None = None,
     backend: BackendName = "auto",
+    executor: Executor = LOCAL,
     command: str = "",
     observer: Observer = SILENT,
 ) -> MadeScene:
@@ -128,6 +129,7 @@ def fit_capture(
         options: What is around the fit.
         fit_options: The fit itself; its seed is that of everything that is drawn at random.
         backend: Rendering backend.
+        executor: Where blocks are fitted.
         command: The words that started it, for the report; may be empty.
         observer: Is told of the progress.
 
@@ -191,6 +193,7 @@ def fit_capture(
             record=_record(options, moving) | ({} if cut is None else {"blocks": cut.record()}),
             objects=objects,
             backend=backend,
+            executor=executor,
             observer=observer,
         )
         # What was done before a fit was resumed counts as optimisation.
@@ -363,6 +366,7 @@ def _fitted(
     record: Mapping[str, Any],
     objects: ObjectsOf | None,
     backend: BackendName,
+    executor: Executor,
     observer: Observer,
 ) -> tuple[FitResult, bool]:
     """Fit and write the scene. Tells whether it was asked to stop, while it wrote too."""
@@ -375,6 +379,7 @@ def _fitted(
                 progress=FitSteps(step),
                 checkpoints=checkpoints,
                 objects=objects,
+                executor=executor,
             )
         capture = data if isinstance(data, Capture) else data.capture
         provenance = _provenance(record, fit_options, backend, result)
