@@ -63,5 +63,7 @@ def test_a_seed_says_which_pixels_are_drawn(make_capture) -> None:
 
 def test_no_new_view_is_refused(make_capture) -> None:
     capture = make_capture()
-    with pytest.raises(InputError, match="new: expected at least one view, got none"):
-        added_gaussians(tiny_scene(), capture.train_views, (), options=OPTIONS)
+    views = capture.train_views
+    for known, new, counts in ((views, (), "11 and 0"), ((), views, "0 and 11")):
+        with pytest.raises(InputError, match=f"expected at least one view each, got {counts}"):
+            added_gaussians(tiny_scene(), known, new, options=OPTIONS)

@@ -541,6 +541,7 @@ def inner(world: World, by_type: dict[type, Any]) -> dict[str, Any]:
             1,
             options=FitOptions(minutes=None, steps=1, max_gaussians=9),
         ),
+        "fit.added_gaussians.options": FitOptions(),
         "fit.Refinement.options": FitOptions(),
         "fit.exposures_record.exposures": {},
         "edit.refit.provenance": {},

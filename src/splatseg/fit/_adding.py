@@ -64,10 +64,12 @@ def added_gaussians(
         The new ones alone, of the same degree of harmonics; perhaps none.
 
     Raises:
-        InputError: If there are no new views.
+        InputError: If there are no new views, or no known ones.
     """
-    if not new:
-        raise InputError("new: expected at least one view, got none.")
+    if not new or not known:
+        raise InputError(
+            f"known, new: expected at least one view each, got {len(known)} and {len(new)}."
+        )
     views = (*new, *_near(known, new))
     photographs = TrainingPhotographs.of(views, options=options)
     unexplained = [
