@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from splatseg.errors import InputError
-from splatseg.fit import FitOptions, added_gaussians
+from splatseg.fit import FitOptions, _adding, added_gaussians
+from splatseg.fit._start import random_points
 
 from .conftest import tiny_scene
 
@@ -49,6 +50,20 @@ def test_they_are_drawn_as_the_scene_is_and_have_its_harmonics(make_capture) -> 
     found = added(half, make_capture())
     assert found.sh.shape[1] == 9
     assert (found.antialiased, found.low_pass) == (True, 0.1)
+
+
+def test_pixels_of_the_new_photographs_alone_are_drawn(make_capture, monkeypatch) -> None:
+    drawn: list[int] = []
+
+    def counted(photographs, **how):
+        drawn.append(how["first"])
+        assert len(photographs) > how["first"]
+        return random_points(photographs, **how)
+
+    monkeypatch.setattr(_adding, "random_points", counted)
+    half = tiny_scene()
+    added(half[half.means[:, 0] < 0], make_capture())
+    assert drawn == [3]
 
 
 def test_a_seed_says_which_pixels_are_drawn(make_capture) -> None:

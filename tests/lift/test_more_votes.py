@@ -107,6 +107,14 @@ def test_ids_of_neighbours_are_forgotten_where_there_are_votes() -> None:
     assert after.confidence.tolist() == pytest.approx([1.0, 0.9])
 
 
+def test_what_ids_of_neighbours_rested_on_counts_no_more() -> None:
+    """A Gaussian with evidence of other ids took its neighbours' all the same."""
+    before = labels([5], [0.9], [8.0], inferred=torch.tensor([True]))
+    after = with_votes(before, votes([[4]], [[1.0]], [0.5]))
+    assert after.ids.tolist() == [4]
+    assert after.evidence.tolist() == [0.5]
+
+
 def test_views_are_counted_together() -> None:
     before = labels([1, 1], [1.0, 1.0], [4.0, 4.0], effective_views=torch.tensor([3.0, 2.0]))
     more = replace(

@@ -50,9 +50,6 @@ features are found."""
 _ROUNDS = 3
 """Times that the pose and the matches which it explains are found from each other."""
 
-_FOCALS = (1.0, 0.8, 1.25, 0.64, 1.6)
-"""Factors of a guessed focal length that are tried."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ResectedView:
@@ -196,21 +193,11 @@ def _resected(
         == (photograph.width, photograph.height)
     ]
     view = _unposed(photograph)
-    limit = _MAX_ERROR * features.scale
+    lens = view.camera
     if same:
-        lens = replace(same[0], cam_from_world=view.camera.cam_from_world)
-        tries, free = [lens], False
-    else:
-        tries = [
-            replace(view.camera, fx=factor * view.camera.fx, fy=factor * view.camera.fy)
-            for factor in _FOCALS
-        ]
-        free = True
-    best = max(
-        (_posed(camera, seen, world, limit, free=free) for camera in tries),
-        key=lambda one: int((one[1] < limit).sum()),
-    )
-    camera, error = best
+        lens = replace(same[0], cam_from_world=lens.cam_from_world)
+    limit = _MAX_ERROR * features.scale
+    camera, error = _posed(lens, seen, world, limit, free=not same)
     inside = error < limit
     if int(inside.sum()) < _MIN_MATCHES:
         return LeftOut(

@@ -6,7 +6,7 @@ import torch
 
 from splatseg.core import InstanceTree, LabelMap, Labels, MaskSet, Rle
 from splatseg.methods.associate import AssociateOptions, associate
-from splatseg.methods.associate._update import with_views
+from splatseg.methods.associate._update import _with_new, with_views
 from splatseg.render import render
 
 from .test_associate import BACKEND, BORDERS, GAUSSIANS, TRUTH, VIEWS, Segments, columns, mapped
@@ -94,6 +94,43 @@ def test_what_no_node_explains_becomes_a_node_where_nothing_was() -> None:
     assert new.id == max(node.id for node in old.nodes) + 1
     assert new.name == f"object {new.id}"
     assert torch.equal(after.cut().ids[:8], old.cut().ids[:8])
+
+
+def test_what_is_something_else_already_is_no_part_of_a_new_thing() -> None:
+    def labels(ids: list[int]) -> Labels:
+        known = torch.tensor(ids, dtype=torch.int32)
+        return Labels(ids=known, confidence=(known > 0).float(), evidence=(known > 0).float())
+
+    known = labels([1, -1, -1, 1, 1, -1])
+    after = _with_new(known, known, labels([7, 7, 7, 9, 9, 9]))
+    assert isinstance(after, Labels)
+    # Of 9 most are of 1 already: it is no new thing.
+    assert after.ids.tolist() == [1, 2, 2, 1, 1, -1]
+    assert after.confidence.tolist() == [1, 1, 1, 1, 1, 0]
+    assert dict(after.info.names) == {2: "object 2"}
+
+
+def test_a_part_is_meant_only_within_the_object_that_the_pixel_shows() -> None:
+    """By masks of halves alone the parts of the left square lie in the middle one."""
+    from splatseg.core import LabelMap
+    from splatseg.methods.associate._update import _NodeMaps
+
+    tree = tree_of(nested(), views=OLD)
+    objects, parts = tree.cut("object").ids, tree.cut("part").ids
+    left, part, stranger = int(objects[0]), int(parts[0]), int(parts[4])
+
+    class Fixed:
+        def __init__(self, ids: list[int]) -> None:
+            self.ids = torch.tensor([ids], dtype=torch.int32)
+
+        def label_map(self, name: str) -> LabelMap:
+            return LabelMap(ids=self.ids)
+
+    maps = _NodeMaps(
+        layer=tree,
+        matched=(Fixed([left, left, left, -1]), Fixed([part, stranger, -1, part])),  # pyright: ignore[reportArgumentType]
+    )
+    assert maps.label_map("v0").ids.tolist() == [[part, left, left, -1]]
 
 
 def test_no_mask_that_is_a_node_is_a_change_of_nothing() -> None:
