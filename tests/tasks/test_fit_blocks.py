@@ -195,3 +195,10 @@ def test_blocks_that_are_fitted_elsewhere_have_the_same_bytes(small_room, straig
     assert shared.checkpoints.steps == 5
     assert shared.checkpoints.failed is not told.note
     assert not (folder / "fit").exists()
+
+
+@pytest.mark.parametrize("count", [0, -3, 1.5, "some"])
+def test_a_number_of_blocks_that_is_none_is_refused_in_words(count):
+    words = "blocks: expected one of auto, off or a whole number, at least 1, got "
+    with pytest.raises(InputError, match=words):
+        MakeSceneOptions(blocks=count)

@@ -229,6 +229,9 @@ def _called(annotation: Any) -> str:
     }
     if annotation in words:
         return words[annotation]
+    if typing.get_origin(annotation) is Annotated:
+        plain, *facts = typing.get_args(annotation)
+        return ", ".join([_called(plain), *(range_in_words(f) for f in facts if _is_range(f))])
     if typing.get_origin(annotation) is Literal:
         return f"one of {', '.join(str(word) for word in typing.get_args(annotation))}"
     if isinstance(annotation, type) and issubclass(annotation, AbstractArray):
