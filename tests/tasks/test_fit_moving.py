@@ -181,12 +181,12 @@ def test_what_is_refused_leaves_nothing(small_room, boxes, box, tmp_path) -> Non
 
 
 def test_a_fit_that_fails_leaves_no_masks(small_room, boxes, tmp_path, monkeypatch) -> None:
-    from splatseg.tasks import make_scene
+    from splatseg.tasks import fit_blocks
 
     def fails(*_: object, **__: object) -> None:
         raise InputError("no")
 
-    monkeypatch.setattr(make_scene, "fit", fails)
+    monkeypatch.setattr(fit_blocks, "fit", fails)
     with pytest.raises(InputError, match="^no$"):
         fitted(small_room, tmp_path / "scene", moving=boxes)
     assert not (tmp_path / "scene").exists()
