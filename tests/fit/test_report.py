@@ -15,7 +15,7 @@ from splatseg.io.scene import save_scene
 from splatseg.lift import GaussianField
 from splatseg.pose import PoseReport
 from splatseg.report.fit_report import verdict_of
-from splatseg.tasks.make_scene import score_and_report
+from splatseg.tasks.fit_scores import score_and_report
 
 OPTIONS = FitOptions(minutes=None, steps=120, max_gaussians=70, seed=3, background="black")
 

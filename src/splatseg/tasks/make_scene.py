@@ -1,18 +1,17 @@
 """Photographs become a scene: poses where they lack them, a fit, scores, a report."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from splatseg.core import LOCAL, Capture, Executor, View
+from splatseg.core import LOCAL, Capture, Executor
 from splatseg.core.boundary import boundary
 from splatseg.core.checkpoints import Checkpoints, deferred_interrupts
 from splatseg.errors import InputError
-from splatseg.evaluate import PhotographReport, evaluate_photographs, render_and_photograph
-from splatseg.evaluate.photographs import MaskUse
+from splatseg.evaluate import PhotographReport
 from splatseg.fit import (
     EXPOSURES,
     CaptureBlocks,
@@ -28,17 +27,11 @@ from splatseg.io.scene import save_scene
 from splatseg.io.scene_folder import (
     BLOCKS_FOLDER,
     CHECKPOINT_FILE,
-    GAUSSIANS_FILE,
-    POSES_FOLDER,
-    scene_path,
 )
-from splatseg.lift import GaussianField
-from splatseg.pose import PoseReport, load_pose_report
+from splatseg.pose import PoseReport
 from splatseg.pose.pointmaps import PointmapReport
 from splatseg.render import BackendName
-from splatseg.report.fit_report import FitReportData, FitVerdict, fit_record, fit_report, verdict_of
-from splatseg.report.images import Gallery, GalleryImage, colour_difference
-from splatseg.report.maps import camera_map
+from splatseg.report.fit_report import FitVerdict, verdict_of
 from splatseg.tasks.add_photographs import add_photographs
 from splatseg.tasks.checkpoints import (
     check_block_count,
@@ -48,6 +41,7 @@ from splatseg.tasks.checkpoints import (
 )
 from splatseg.tasks.fit_blocks import FitSteps, ObjectsOf, fitted, in_cells
 from splatseg.tasks.fit_objects import object_labels
+from splatseg.tasks.fit_scores import score_and_report
 from splatseg.tasks.moving import (
     LeftOut,
     capture_without_moving,
@@ -56,12 +50,10 @@ from splatseg.tasks.moving import (
 )
 from splatseg.tasks.photographs import MakeSceneOptions, capture_of, with_depth_evidence, with_scans
 from splatseg.tasks.work import (
-    REPORTS_FOLDER,
     SILENT,
     Observer,
     scene_of_capture,
     versions,
-    write_page,
 )
 
 
@@ -429,118 +421,3 @@ def _provenance(
         **({EXPOSURES: exposures_record(result.exposures)} if result.exposures else {}),
         "versions": versions("splatseg", "torch"),
     }
-
-
-_NEXT = ("worst", "second worst", "third worst")
-
-# Scoring the held-out views may take this long, seconds: writing belongs to the minutes too.
-_SCORING = 20.0
-
-
-def score_and_report(
-    root: Path,
-    capture: Capture,
-    result: FitResult,
-    *,
-    options: FitOptions,
-    backend: BackendName,
-    scoring: bool,
-    command: str = "",
-    timings: Mapping[str, float] | None = None,
-    poses: Mapping[str, Any] | None = None,
-) -> tuple[FitReportData, Path]:
-    """Score the held-out views, write SCENE/reports/fit.html and fit.json.
-
-    As many views are scored as the time for it allows; with `scoring` False none is, for who
-    stopped a fit does not want to wait.
-
-    Args:
-        root: Folder of the scene.
-        capture: What it was fitted to.
-        result: The fit.
-        options: Of the fit.
-        backend: Rendering backend.
-        scoring: Whether held-out views are scored.
-        command: The words that started it; may be empty.
-        timings: Seconds by part of the command until now.
-        poses: How cameras were found; None takes what is kept with the scene.
-
-    Returns:
-        What the page tells, and where it is.
-    """
-    began = time.monotonic()
-    views = [view for view in capture.test_views if view.image is not None]
-    scores = None
-    if views and scoring:
-        scores = evaluate_photographs(
-            GaussianField(result.gaussians, backend=backend),
-            views,
-            masks=options.masks,
-            seconds=_SCORING,
-        )
-    data = FitReportData(
-        capture=replace(capture, views=result.views or capture.views),
-        options=options,
-        result=result,
-        scores=scores,
-        held_out=len(views),
-        file_bytes=(root / GAUSSIANS_FILE).stat().st_size,
-        command=command,
-        poses=_poses(root) if poses is None else poses,
-        facts={"backend": backend},
-    )
-    pairs = None
-    if scores is not None:
-        pairs = _pairs(result, views, scores, masks=options.masks, backend=backend)
-    cameras = camera_map(result.gaussians, data.capture.views, up=capture.up)
-    spent = {**(timings or {}), "scores and report": time.monotonic() - began}
-    data = replace(data, timings=spent)
-    page = fit_report(data, pairs=pairs, cameras=cameras)
-    path = scene_path(root, REPORTS_FOLDER, "fit.html")
-    return data, write_page(page, path, record=fit_record(data))
-
-
-def _pairs(
-    result: FitResult,
-    views: Sequence[View],
-    scores: PhotographReport,
-    *,
-    masks: MaskUse,
-    backend: BackendName,
-) -> Gallery:
-    """Photograph, render and difference of the worst views, the median and the best one."""
-    ordered = sorted(scores.per_view, key=lambda score: score.psnr)
-    median, last = len(ordered) // 2, len(ordered) - 1
-    # Of few views some are two of these; each is shown once.
-    ranks = {0: "worst"} | {i: _NEXT[i] for i in range(1, min(len(_NEXT), median))}
-    ranks |= {median: "median", last: "best"} if last else {0: "the only one"}
-    names = {view.name: view for view in views}
-    rows: list[tuple[str, tuple[GalleryImage, ...]]] = []
-    for rank, label in ranks.items():
-        score = ordered[rank]
-        picture, photograph = render_and_photograph(
-            GaussianField(result.gaussians, backend=backend), names[score.name], masks=masks
-        )
-        rows.append(
-            (
-                f"{label}: {score.name}",
-                (
-                    GalleryImage(image=photograph),
-                    GalleryImage(
-                        image=picture, caption=f"{score.psnr:.2f} dB, SSIM {score.ssim:.3f}"
-                    ),
-                    GalleryImage(image=colour_difference(picture, photograph)),
-                ),
-            )
-        )
-    return Gallery(
-        title="Held-out views, the worst first",
-        columns=("photograph", "rendered", "difference"),
-        rows=tuple(rows),
-        note="The difference is four times as bright as it is.",
-    )
-
-
-def _poses(root: Path) -> dict[str, Any] | None:
-    report = load_pose_report(root / POSES_FOLDER)
-    return None if report is None else asdict(report)
