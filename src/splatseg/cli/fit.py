@@ -19,8 +19,15 @@ from splatseg.cli._shared import (
 from splatseg.errors import InputError
 from splatseg.fit import FitOptions, Preset, Strategy
 from splatseg.report.fit_report import scored_of
-from splatseg.tasks import ImportOptions, MadeScene, MakeSceneOptions, fit_capture, import_scene
-from splatseg.tasks.executors import ExecutorOptions, open_executor
+from splatseg.tasks import (
+    ExecutorOptions,
+    ImportOptions,
+    MadeScene,
+    MakeSceneOptions,
+    fit_capture,
+    import_scene,
+    open_executor,
+)
 
 _DEFAULT = FitOptions()
 

@@ -16,6 +16,7 @@ from splatseg.fit._parameters import final_gaussians
 from splatseg.fit._photographs import TrainingPhotographs
 from splatseg.fit._start import (
     COUNT,
+    MAX_DIFFERENCE,
     depth_range_of_points,
     initial_parameters,
     random_points,
@@ -33,9 +34,6 @@ _DIFFERENCE = 0.1
 
 _COVERED = 0.5
 """Opacity under which nothing of the scene is at a pixel."""
-
-_MAX_DIFFERENCE = 0.05
-"""Photometric cost of a place, as of points that are added to a capture's own."""
 
 
 @boundary
@@ -83,7 +81,7 @@ def added_gaussians(
         count=min(COUNT, max(1, len(gaussians) // 4)),
         generator=generator,
         depth_range=depth_range_of_points(centres, photographs),
-        max_difference=_MAX_DIFFERENCE,
+        max_difference=MAX_DIFFERENCE,
         first=len(new),
     )
     wanted = torch.zeros(len(points), dtype=torch.bool)

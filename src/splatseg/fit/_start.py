@@ -28,7 +28,7 @@ COUNT = 30_000
 _MAX_GAUSSIANS_SHARE = 0.5
 """The capture's own points are filled up to `COUNT`, or to this share of `max_gaussians`."""
 
-_MAX_DIFFERENCE = 0.05
+MAX_DIFFERENCE = 0.05
 """Maximum photometric cost of points that are added to the capture's own, mean difference of
 colours in [0, 1]."""
 
@@ -90,7 +90,7 @@ def with_start_points(
         count=count,
         generator=generator,
         depth_range=depth_range_of_points(own, photographs),
-        max_difference=_MAX_DIFFERENCE,
+        max_difference=MAX_DIFFERENCE,
     )
     return replace(capture, points=_joined(own, more))
 

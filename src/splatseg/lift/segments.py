@@ -94,7 +94,7 @@ def reduced_segments(segments: LabelMap | MaskSet, longest: int) -> LabelMap | M
     h, w = max(1, round(share * height)), max(1, round(share * width))
 
     def taken(picture: Tensor) -> Tensor:
-        return _at_middles(picture, h, w)
+        return at_middles(picture, h, w)
 
     if isinstance(segments, LabelMap):
         return LabelMap(ids=taken(segments.ids.cpu()))
@@ -102,8 +102,8 @@ def reduced_segments(segments: LabelMap | MaskSet, longest: int) -> LabelMap | M
     return replace(segments, height=h, width=w, masks=masks)
 
 
-def _at_middles(picture: Tensor, h: int, w: int) -> Tensor:
-    """What is at the middle of each of h x w cells."""
+def at_middles(picture: Tensor, h: int, w: int) -> Tensor:
+    """What is at the middle of each of h x w cells of a picture, be they larger than its pixels."""
     height, width = picture.shape
     down = ((torch.arange(h) + 0.5) * height / h).long()
     across = ((torch.arange(w) + 0.5) * width / w).long()
@@ -133,8 +133,8 @@ class ReducedMaps:
         h, w = max(1, round(share * full.height)), max(1, round(share * full.width))
         confidence = full.confidence
         return LabelMap(
-            ids=_at_middles(full.ids.cpu(), h, w),
-            confidence=None if confidence is None else _at_middles(confidence.cpu(), h, w),
+            ids=at_middles(full.ids.cpu(), h, w),
+            confidence=None if confidence is None else at_middles(confidence.cpu(), h, w),
         )
 
 

@@ -113,7 +113,7 @@ def test_what_is_something_else_already_is_no_part_of_a_new_thing() -> None:
 def test_a_part_is_meant_only_within_the_object_that_the_pixel_shows() -> None:
     """By masks of halves alone the parts of the left square lie in the middle one."""
     from splatseg.core import LabelMap
-    from splatseg.methods.associate._update import _NodeMaps
+    from splatseg.methods.associate._update import _NodeMaps, _objects
 
     tree = tree_of(nested(), views=OLD)
     objects, parts = tree.cut("object").ids, tree.cut("part").ids
@@ -127,7 +127,7 @@ def test_a_part_is_meant_only_within_the_object_that_the_pixel_shows() -> None:
             return LabelMap(ids=self.ids)
 
     maps = _NodeMaps(
-        layer=tree,
+        objects=_objects(tree),
         matched=(Fixed([left, left, left, -1]), Fixed([part, stranger, -1, part])),  # pyright: ignore[reportArgumentType]
     )
     assert maps.label_map("v0").ids.tolist() == [[part, left, left, -1]]

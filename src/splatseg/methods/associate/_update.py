@@ -21,11 +21,12 @@ from splatseg.core import (
     InstanceTree,
     LabelMap,
     Labels,
+    LabelSource,
     MaskSet,
     SegmentSource,
     View,
 )
-from splatseg.lift.segments import MatchedMaps
+from splatseg.lift.segments import MatchedMaps, at_middles
 from splatseg.lift.voting.confusion import CANDIDATES
 from splatseg.lift.voting.more_votes import with_votes
 from splatseg.lift.voting.uplift import UpliftOptions, uplift
@@ -68,7 +69,7 @@ def with_views(
     """
     known = layer.labels if isinstance(layer, InstanceTree) else layer
     maps = _NodeMaps(
-        layer=layer,
+        objects=_objects(layer),
         matched=tuple(
             MatchedMaps(
                 gaussians=gaussians, views=views, source=source, labels=labels,
@@ -89,8 +90,11 @@ def with_views(
             progress=progress,
         )
         known = with_votes(known, votes)
-    unknown = _Unmatched(source=source, maps=shown)
-    if unknown.count(views):
+    unknown = _Segments(
+        source=source,
+        found={name: _unmatched(source.segments_of(name), shown[name]) for name in shown},
+    )
+    if unknown.any:
         return _with_new(layer, known, associated(unknown, views))
     return replace(layer, labels=known) if isinstance(layer, InstanceTree) else known
 
@@ -103,24 +107,34 @@ def _cuts(layer: Labels | InstanceTree) -> tuple[Labels, ...]:
     return (objects,) if torch.equal(objects.ids, parts.ids) else (objects, parts)
 
 
+def _objects(layer: Labels | InstanceTree) -> Tensor:
+    """`_NodeMaps.objects` of a layer."""
+    if not isinstance(layer, InstanceTree):
+        return torch.full((1,), UNLABELLED, dtype=torch.int32)
+    levels = {node.id: node.level for node in layer.nodes}
+    found = torch.full((max(levels, default=0) + 2,), UNLABELLED, dtype=torch.int32)
+    for id in levels:
+        found[id] = next((n for n in layer.path(id) if levels[n] == "object"), UNLABELLED)
+    return found
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _NodeMaps:
     """Of each pixel the deepest node that a segment over it is."""
 
-    layer: Labels | InstanceTree
-    matched: tuple[MatchedMaps, ...]
+    matched: tuple[LabelSource, ...]
+    """Of objects, and of the deepest nodes where these differ."""
+
+    objects: Tensor
+    """Of each id of a node the object that it is or lies in, -1 for none; the last is for -1."""
 
     def label_map(self, name: str) -> LabelMap:
         """Ids of nodes in a view."""
         coarse = self.matched[0].label_map(name)
-        if len(self.matched) == 1 or not isinstance(self.layer, InstanceTree):
+        if len(self.matched) == 1:
             return coarse
         fine = self.matched[1].label_map(name)
-        levels = {node.id: node.level for node in self.layer.nodes}
-        above = torch.full((max(levels) + 2,), UNLABELLED, dtype=torch.int32)
-        for id in levels:
-            path = self.layer.path(id)
-            above[id] = next((n for n in path if levels[n] == "object"), UNLABELLED)
+        above = self.objects
         # A part is meant where it lies in the object that the pixel shows.
         inside = (fine.ids != UNLABELLED) & (above[fine.ids.long()] == coarse.ids)
         return LabelMap(ids=torch.where(inside, fine.ids, coarse.ids))
@@ -145,15 +159,17 @@ _MIN_UNKNOWN = 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Unmatched:
-    """The segments of views that lie where no known node was recognised."""
+class _Segments:
+    """Some of the segments of views."""
 
     source: SegmentSource
-    maps: Mapping[str, LabelMap]
+    """All of them."""
+
+    found: Mapping[str, LabelMap | MaskSet]
 
     @property
     def view_names(self) -> Sequence[str]:
-        return tuple(self.maps)
+        return tuple(self.found)
 
     @property
     def overlapping(self) -> bool:
@@ -163,45 +179,36 @@ class _Unmatched:
     def persistent(self) -> bool:
         return self.source.persistent
 
+    @property
+    def any(self) -> bool:
+        """Whether a view has one."""
+        return any(
+            len(one) > 0 if isinstance(one, MaskSet) else bool((one.ids != UNLABELLED).any())
+            for one in self.found.values()
+        )
+
     def categories_of(self, name: str) -> Mapping[int, int]:
         return self.source.categories_of(name)
 
-    def count(self, views: Sequence[View]) -> int:
-        """Segments in some views."""
-        found = 0
-        for view in views:
-            segments = self.segments_of(view.name)
-            found += (
-                len(segments)
-                if isinstance(segments, MaskSet)
-                else int((segments.ids != UNLABELLED).any())
-            )
-        return found
-
     def segments_of(self, name: str) -> LabelMap | MaskSet:
-        segments = self.source.segments_of(name)
-        free = _enlarged(self.maps[name].ids == UNLABELLED, segments.height, segments.width)
-        if isinstance(segments, LabelMap):
-            ids, place = torch.unique(segments.ids.cpu().long(), return_inverse=True)
-            inside = torch.zeros(len(ids)).index_add_(
-                0, place.reshape(-1), free.reshape(-1).float()
-            )
-            share = inside / torch.bincount(place.reshape(-1), minlength=len(ids))
-            new = share >= _MIN_UNKNOWN
-            return replace(segments, ids=torch.where(new[place], segments.ids, UNLABELLED))
-        rows = [
-            i
-            for i in range(len(segments))
-            if float(free[segments.dense(i)].float().mean()) >= _MIN_UNKNOWN
-        ]
-        return segments.subset(rows)
+        return self.found[name]
 
 
-def _enlarged(mask: Tensor, height: int, width: int) -> Tensor:
-    """A mask at another size, by the pixel at the middle of each."""
-    down = ((torch.arange(height) + 0.5) * mask.shape[0] / height).long()
-    across = ((torch.arange(width) + 0.5) * mask.shape[1] / width).long()
-    return mask[down.unsqueeze(1), across]
+def _unmatched(segments: LabelMap | MaskSet, shown: LabelMap) -> LabelMap | MaskSet:
+    """The segments of a view that lie where no known node was recognised."""
+    free = at_middles(shown.ids == UNLABELLED, segments.height, segments.width)
+    if isinstance(segments, LabelMap):
+        ids, place = torch.unique(segments.ids.cpu().long(), return_inverse=True)
+        inside = torch.zeros(len(ids)).index_add_(0, place.reshape(-1), free.reshape(-1).float())
+        share = inside / torch.bincount(place.reshape(-1), minlength=len(ids))
+        new = share >= _MIN_UNKNOWN
+        return replace(segments, ids=torch.where(new[place], segments.ids, UNLABELLED))
+    rows = [
+        i
+        for i in range(len(segments))
+        if float(free[segments.dense(i)].float().mean()) >= _MIN_UNKNOWN
+    ]
+    return segments.subset(rows)
 
 
 def _with_new(

@@ -68,7 +68,6 @@ def view_entries(collecting: Collecting, view: View) -> Iterator[ViewEntries]:
     worth /= segments.height * segments.width
     camera = camera_of_map(view, segments.height, segments.width)
     found = view_masses(collecting.gaussians, camera, segments, backend=collecting.backend)
-    outside = isinstance(segments, MaskSet)
     segment, gaussian = found.segment.numpy(), found.gaussian.numpy()
     kept = found.weight.numpy() > MIN_MASS
     segment, gaussian = segment[kept], gaussian[kept].astype(np.int32)
