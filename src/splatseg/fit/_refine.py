@@ -16,7 +16,7 @@ from splatseg._check import check_range
 from splatseg.core import Camera, Gaussians, View
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError
-from splatseg.fit._options import FitOptions
+from splatseg.fit._options import REFINEMENT_RATES, FitOptions
 from splatseg.fit._parameters import (
     Parameters,
     UpdateSettings,
@@ -150,9 +150,10 @@ class Refinement:
         )
         found = self._training.gradients(self._state[0], example, settings=settings)
         self._steps_done += 1
-        rates = rates_at(progress, options=self._options, extent=self._extent)
+        rates = REFINEMENT_RATES[self._options.rates]
+        now = rates_at(progress, rates=rates, options=self._options, extent=self._extent)
         with torch.no_grad():
-            update = UpdateSettings(rates=rates, step=self._steps_done)
+            update = UpdateSettings(rates=now, step=self._steps_done, beta2=rates.second_moments)
             self._training.update(self._state, found, settings=update)
             self._views.update(example.index, progress=progress)
 
