@@ -1,6 +1,6 @@
 """Time and peak memory of lifting, each part in a process of its own.
 
-    python benchmarks/lift.py [features | masks | labels] [--views N]
+    python benchmarks/lift.py [features | masks | labels] [--views N] [--gaussians N] [--ids N]
     python benchmarks/lift.py nested SCENE EVIDENCE [--views N]
 
 `features`: 64-d features of 100 views at 512x384 onto 200 000 Gaussians; cells of 16 pixels,
@@ -41,8 +41,8 @@ from splatseg.methods.associate import associate
 from splatseg.render.cpu import threads
 
 WIDTH, HEIGHT = 512, 384
-GAUSSIANS = 200_000
-IDS = 500
+GAUSSIANS, IDS = 200_000, 500
+"""On which, and masks of a view: by default."""
 
 
 def camera(index: int) -> Camera:
@@ -63,12 +63,19 @@ def camera(index: int) -> Camera:
 
 
 class Made:
-    """Evidence that is made when it is asked for."""
+    """Gaussians, and evidence that is made when it is asked for.
 
-    def __init__(self, views: int) -> None:
+    Args:
+        views: Of the views.
+        gaussians: On the walls of a room.
+        ids: Masks, or patches, of each view.
+    """
+
+    def __init__(self, views: int, gaussians: int, ids: int) -> None:
+        self.count, self.ids = gaussians, ids
         self.views = [View(name=f"view_{i:04d}", camera=camera(i)) for i in range(views)]
         self.view_names = tuple(view.name for view in self.views)
-        self._coarse = math.ceil(math.sqrt(IDS))
+        self._coarse = math.ceil(math.sqrt(ids))
 
     def features(self, name: str) -> FeatureMap:
         """64 channels in cells of 16 pixels."""
@@ -77,47 +84,47 @@ class Made:
         return FeatureMap(features=torch.from_numpy(values), stride=16, height=HEIGHT, width=WIDTH)
 
     def label_map(self, name: str) -> LabelMap:
-        """500 patches, whose ids are used in no other view."""
+        """Patches, whose ids are used in no other view."""
         rows = torch.arange(HEIGHT) * self._coarse // HEIGHT
         columns = torch.arange(WIDTH) * self._coarse // WIDTH
-        patch = (rows[:, None] * self._coarse + columns[None]) % IDS
-        return LabelMap(ids=patch + 1 + IDS * int(name[-4:]))
+        patch = (rows[:, None] * self._coarse + columns[None]) % self.ids
+        return LabelMap(ids=patch + 1 + self.ids * int(name[-4:]))
 
     def masks(self, name: str) -> MaskSet:
         """Discs of 1 to 60 pixels radius; each covers a hundredth of the image on average."""
         rng = np.random.default_rng(int(name[-4:]))
         y, x = np.mgrid[:HEIGHT, :WIDTH]
         masks: list[Rle] = []
-        for _ in range(IDS):
+        for _ in range(self.ids):
             u, v, radius = rng.random() * WIDTH, rng.random() * HEIGHT, 60 * rng.random() ** 2 + 1
             masks.append(Rle.encode(torch.from_numpy((x - u) ** 2 + (y - v) ** 2 < radius**2)))
         return MaskSet(
             height=HEIGHT, width=WIDTH, masks=tuple(masks),
-            scores=torch.ones(IDS), levels=torch.zeros(IDS, dtype=torch.int32),
+            scores=torch.ones(self.ids), levels=torch.zeros(self.ids, dtype=torch.int32),
         )  # fmt: skip
 
 
 def features(made: Made) -> str:
     """64-d features."""
-    found = uplift_features(room(GAUSSIANS, 0), made.views, made)
+    found = uplift_features(room(made.count, 0), made.views, made)
     seen = int((found.weights > 0).sum())
-    return f"{found.values.shape[1]}-d features onto {GAUSSIANS} Gaussians, {seen} seen"
+    return f"{found.values.shape[1]}-d features onto {made.count} Gaussians, {seen} seen"
 
 
 def labels(made: Made) -> str:
     """More ids than any table holds."""
     options = UpliftOptions(memory=1 << 28, candidates=4)
-    found = uplift(room(GAUSSIANS, 0), made.views, made, options=options)
+    found = uplift(room(made.count, 0), made.views, made, options=options)
     seen = int((found.ids >= 0).sum())
-    return f"{IDS * len(made.views)} ids onto {GAUSSIANS} Gaussians, {seen} labelled"
+    return f"{made.ids * len(made.views)} ids onto {made.count} Gaussians, {seen} labelled"
 
 
 def masks(made: Made) -> str:
     """Overlapping masks, one view after the other."""
-    gaussians, entries = room(GAUSSIANS, 0), 0
+    gaussians, entries = room(made.count, 0), 0
     for view in made.views:
         entries += len(view_masses(gaussians, view.camera, made.masks(view.name)).weight)
-    return f"{IDS * len(made.views)} masks, {entries} masses on {GAUSSIANS} Gaussians"
+    return f"{made.ids * len(made.views)} masks, {entries} masses on {made.count} Gaussians"
 
 
 def nested(scene: Path, evidence: Path, views: int | None) -> str:
@@ -149,6 +156,8 @@ def main() -> None:
     parser.add_argument("scene", nargs="?", type=Path)
     parser.add_argument("evidence", nargs="?", type=Path)
     parser.add_argument("--views", type=int)
+    parser.add_argument("--gaussians", type=int, default=GAUSSIANS)
+    parser.add_argument("--ids", type=int, default=IDS)
     args = parser.parse_args()
     if (args.part == "nested") != (args.scene is not None) or bool(args.scene) != bool(
         args.evidence
@@ -162,7 +171,7 @@ def main() -> None:
             subprocess.run([sys.executable, __file__, part, *sys.argv[1:]], check=True)
         return
     measure, usual = PARTS[args.part]
-    made = Made(args.views or usual)
+    made = Made(args.views or usual, args.gaussians, args.ids)
     started, worked = time.perf_counter(), time.process_time()
     what = measure(made)
     wall, cpu = time.perf_counter() - started, time.process_time() - worked

@@ -263,8 +263,8 @@ def test_a_block_corrects_the_bias_of_the_steps_of_the_whole(capture: Capture):
     ]
     seen = moved[0].abs() > 1e-6
     assert int(seen.sum()) > 20
-    # m / (1 - 0.9^t) over the root of v / (1 - 0.9999^t), at t = 3 and t = 1.
-    ratio = (0.1 / (1 - 0.9**3)) / (0.0001 / (1 - 0.9999**3)) ** 0.5
+    # m / (1 - 0.9^t) over the root of v / (1 - 0.999^t), at t = 3 and t = 1.
+    ratio = (0.1 / (1 - 0.9**3)) / (0.001 / (1 - 0.999**3)) ** 0.5
     torch.testing.assert_close(
         moved[1][seen] / moved[0][seen],
         torch.tensor(ratio).expand(int(seen.sum())),

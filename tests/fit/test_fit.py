@@ -334,7 +334,7 @@ SCHEDULE = FitOptions(sh_degree=2, max_gaussians=1000)
 @pytest.mark.parametrize(
     ("rates", "means", "scales", "final"),
     [
-        (RATES["fast"], (8e-4, 8e-5), 1e-2, 1.0),
+        (RATES["fast"], (8e-4, 8e-6), 1e-2, 1.0),
         (RATES["published"], (1.6e-4, 1.6e-6), 5e-3, 1.0),
         (REFINEMENT_RATES["fast"], (8e-4, 8e-6), 1e-2, 0.2),
     ],

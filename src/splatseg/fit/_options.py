@@ -62,10 +62,6 @@ class Rates:
     sh_degree_interval: float
     """Progress between one degree of the spherical harmonics and the next."""
 
-    second_moments: float
-    """Adam's beta_2. Bias correction counts steps of the fit, so that the nearer it is to 1, the
-    farther Gaussians move that few views have shown yet: by the root of steps over views."""
-
     average_from: float
     """Progress from which on the parameters are averaged, see `TailAverage`; infinity for none."""
 
@@ -73,13 +69,12 @@ class Rates:
 RATES = {
     "fast": Rates(
         position=8e-4,
-        position_end=8e-5,
+        position_end=8e-6,
         scale=1e-2,
         final=1.0,
         quarter_until=0.02,
         half_until=0.07,
         sh_degree_interval=0.1,
-        second_moments=0.9999,
         average_from=0.75,
     ),
     "published": Rates(
@@ -90,14 +85,13 @@ RATES = {
         quarter_until=0.0,
         half_until=0.0,
         sh_degree_interval=1 / 30,
-        second_moments=0.999,
         average_from=math.inf,
     ),
 }
 
 # Refinements are short and are not averaged, so their rates decay.
 REFINEMENT_RATES = {
-    "fast": replace(RATES["fast"], position_end=8e-6, final=0.2, second_moments=0.999),
+    "fast": replace(RATES["fast"], final=0.2),
     "published": RATES["published"],
 }
 

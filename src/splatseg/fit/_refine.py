@@ -150,10 +150,15 @@ class Refinement:
         )
         found = self._training.gradients(self._state[0], example, settings=settings)
         self._steps_done += 1
-        rates = REFINEMENT_RATES[self._options.rates]
-        now = rates_at(progress, rates=rates, options=self._options, extent=self._extent)
+        options = self._options
+        rates = rates_at(
+            progress,
+            rates=REFINEMENT_RATES[options.rates],
+            options=options,
+            extent=self._extent,
+        )
         with torch.no_grad():
-            update = UpdateSettings(rates=now, step=self._steps_done, beta2=rates.second_moments)
+            update = UpdateSettings(rates=rates, step=self._steps_done)
             self._training.update(self._state, found, settings=update)
             self._views.update(example.index, progress=progress)
 

@@ -415,17 +415,16 @@ class FitRun:
 
     def _update(self, found: StepGradients, progress: float) -> None:
         count = len(self._state[0])
-        rates = RATES[self._options.rates]
-        now = rates_at(progress, rates=rates, options=self._options, extent=self._extent)
+        options = self._options
+        rates = rates_at(progress, rates=RATES[options.rates], options=options, extent=self._extent)
         unit = _REFERENCE_SIZE / self._size
         settings = UpdateSettings(
-            rates=now,
+            rates=rates,
             step=round((self.steps + 1) * self._options.bias_correction_steps),
             opacity_penalty=self._options.opacity_penalty / count,
             scale_penalty=self._options.scale_penalty * unit / (3 * count),
-            noise=self._options.noise * now.means * unit**2,
+            noise=self._options.noise * rates.means * unit**2,
             seed=self._options.seed,
-            beta2=rates.second_moments,
         )
         self._training.update(self._state, found, settings=settings)
 
