@@ -20,6 +20,7 @@ from torch import Tensor
 
 from splatseg._check import check_finite, check_values
 from splatseg.core.boundary import boundary, convert_fields
+from splatseg.core.chunks import Chunks
 from splatseg.core.coerce import as_rows
 from splatseg.core.rigid import Similarity, quaternion_from_rotation, quaternion_multiply
 from splatseg.core.sh import SH_C0, degree_of, rotate_sh
@@ -118,6 +119,11 @@ class Gaussians(Previewed):
     """Variance of the filter that they are drawn with, square pixels
     (`RenderOptions.low_pass`). Other than 3DGS's, it goes with them into PLY files."""
 
+    chunks: Chunks | None = field(default=None, init=False, repr=False)
+    """Where they are on the disk: the arrays are maps of files then, and a view reads what it needs.
+    None for Gaussians in memory, and for all that is made of others: whoever changes a column or
+    takes rows has Gaussians of his own."""
+
     def __post_init__(self) -> None:
         convert_fields(self)
         n = len(self.means)
@@ -168,6 +174,12 @@ class Gaussians(Previewed):
         """The same Gaussians with some columns exchanged."""
         return _replace(self, **changes)
 
+    def in_chunks(self, chunks: Chunks) -> "Gaussians":
+        """The same Gaussians, of which views read `chunks`; see `io.chunks.open_chunks`."""
+        made = self.replace()
+        object.__setattr__(made, "chunks", chunks)
+        return made
+
     @boundary
     def to(
         self,
@@ -197,8 +209,12 @@ class Gaussians(Previewed):
         """Raise `RangeError` unless every row can be rendered.
 
         Means, rotations, scales, opacities and SH are finite, scales are not negative,
-        opacities lie in [0, 1] and no quaternion is zero.
+        opacities lie in [0, 1] and no quaternion is zero. Of Gaussians on the disk only the means
+        are looked at, which are used as a whole; what a view reads is checked then.
         """
+        if self.chunks is not None:
+            check_finite("means", self.means)
+            return
         check_finite("means", self.means)
         check_finite("rotations", self.rotations)
         check_values("scales", self.scales, 0.0, float("inf"))

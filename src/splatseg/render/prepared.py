@@ -6,10 +6,10 @@ identity and nothing is resampled. The warp depends on the lens alone and is kep
 """
 
 from collections.abc import Sequence
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, Int64, UInt8
 from torch import Tensor
 
 from splatseg._check import check_shape
@@ -29,6 +29,7 @@ from splatseg.render._backend import (
     options_for,
 )
 from splatseg.render._picture import eight_bits, mixed_colours, without_hidden
+from splatseg.render._row_view import RowsView
 from splatseg.render._rows import SparseWeights
 from splatseg.render._values import (
     BackProjected,
@@ -79,10 +80,30 @@ def prepare(
         >>> tuple(drawn.image.shape), tuple(back.sums.shape)
         ((9, 9, 5), (1, 5))
     """
-    check_scene(gaussians)
+    if gaussians.chunks is None:
+        check_scene(gaussians)
     chosen = get_backend(backend, like=gaussians.means)
     options = options or options_for(gaussians, backend)
-    return PreparedView(gaussians, camera, options=options, backend=chosen)
+    if gaussians.chunks is None:
+        return PreparedView(gaussians, camera, options=options, backend=chosen)
+    near, rows = gaussians.chunks.view_of(
+        undistorted_camera(camera),
+        near=options.near,
+        low_pass=options.low_pass,
+        coefficients=gaussians.sh.shape[1],
+    )
+    check_scene(near)
+    part = ViewPart(PreparedView(near, camera, options=options, backend=chosen), rows)
+    return PreparedView(gaussians, camera, options=options, backend=chosen, part=part)
+
+
+class ViewPart(NamedTuple):
+    """A view of the Gaussians that were read from the disk for it."""
+
+    view: "PreparedView"
+
+    rows: Int64[Tensor, "m"]
+    """Which row of the scene each of its Gaussians is, ascending."""
 
 
 class PreparedView:
@@ -90,14 +111,26 @@ class PreparedView:
 
     @boundary
     def __init__(
-        self, gaussians: Gaussians, camera: Camera, *, options: RenderOptions, backend: Backend
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        *,
+        options: RenderOptions,
+        backend: Backend,
+        part: ViewPart | None = None,
     ) -> None:
         """Take what `prepare` checked; nothing is projected before it is needed."""
         self._gaussians, self._options, self._backend = gaussians, options, backend
         self._count = len(gaussians)
         self._device = gaussians.device
         self._camera = camera
-        self._view = backend.prepare(gaussians, undistorted_camera(camera), options=options)
+        self._part = part
+        pinhole = undistorted_camera(camera)
+        self._view: BackendView = (
+            backend.prepare(gaussians, pinhole, options=options)
+            if part is None
+            else RowsView(part.view.own, part.rows, count=len(gaussians), camera=pinhole)
+        )
         self._shown: tuple[Tensor, BackendView] | None = None
 
     def __enter__(self) -> Self:
@@ -116,6 +149,17 @@ class PreparedView:
     def camera(self) -> Camera:
         """The camera of the view's pixels."""
         return self._camera
+
+    @property
+    def part(self) -> ViewPart | None:
+        """Of a scene on the disk the view of what was read: work that goes with the Gaussians of
+        a view, and not with those of the scene, is done there. None where all are in memory."""
+        return self._part
+
+    @property
+    def own(self) -> BackendView:
+        """The backend's view."""
+        return self._view
 
     @boundary
     def render(
@@ -194,6 +238,12 @@ class PreparedView:
             ([126, 126, 126], [252, 0, 0])
         """
         check_picture(self._count, tint=tint, signal=signal, shown=shown)
+        if self._part is not None:
+            tint, signal, shown = (
+                None if column is None else column[self._part.rows]
+                for column in (tint, signal, shown)
+            )
+            return self._part.view.picture(tint, signal=signal, shown=shown)
         view, gaussians = self._view, self._gaussians
         if shown is not None and not bool(shown.all()):
             gaussians = without_hidden(gaussians, shown)
