@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from splatseg.cli._shared import Field, OnViews, print_result
+from splatseg.cli._shared import Field, Memory, OnViews, print_result
 from splatseg.errors import InputError
 from splatseg.evaluate import PointSurfaceOptions
 from splatseg.io.captures import read_capture
@@ -54,6 +54,8 @@ class Command(OnViews):
 
     field: Field = None
 
+    memory: Memory = None
+
     surface: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Labelled mesh or points in the world of the cameras, drawn instead of the scene: a PLY with
     ids of vertices or faces, whose columns are the names of its labels, or an .npz of points with
@@ -79,7 +81,7 @@ def run(command: Command) -> None:
     started = time.monotonic()
     if command.surface is None:
         _check_without_surface(command)
-        scene = command.open()
+        scene = command.open_streamed(command.memory)
         with command.open_executor() as executor:
             done = render_views(
                 scene,
@@ -113,6 +115,8 @@ def _truth(command: Command, path: Path) -> Rendering:
         raise InputError("field: expected none with a surface, which is drawn instead of it.")
     if command.executing != ExecutorOptions():
         raise InputError("executor: expected none with a surface, which is drawn in this process.")
+    if command.memory is not None:
+        raise InputError("memory: expected none with a surface, for which no Gaussians are read.")
     options = command.rendering
     if options.what == RenderingOptions().what:
         options = replace(options, what=())

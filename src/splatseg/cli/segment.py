@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar
 
 import tyro
 
-from splatseg.cli._shared import OnViews, print_result, typed
+from splatseg.cli._shared import Memory, OnViews, print_result, typed
 from splatseg.cli._words import option_value
 from splatseg.core import UNLABELLED, Features, Selection, VoxelFeatures
 from splatseg.core.instance_tree import layer_kind
@@ -29,6 +29,7 @@ from splatseg.tasks import (
     save_segmentation,
     segment,
 )
+from splatseg.tasks.work import check_streams
 
 CONFIG = (tyro.conf.HelptextFromCommentsOff,)
 """Options of the method and the shared ones are flags without a prefix."""
@@ -96,6 +97,8 @@ class Command(OnViews):
     )
     """How a stopped training goes on."""
 
+    memory: Memory = None
+
     options: Any = None
     """Options of the method."""
 
@@ -159,7 +162,9 @@ def run(command: Command) -> None:
     """Segment a scene."""
     started = time.monotonic()
     observer = command.observer
-    scene = command.open()
+    scene = command.open_streamed(command.memory)
+    if command.report:
+        check_streams(scene, "--report")
     opened = time.monotonic() - started
     truth = None if command.truth is None else open_evidence(command.truth)
     method = find_method(command.method)

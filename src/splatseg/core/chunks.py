@@ -1,4 +1,4 @@
-r"""Gaussians that stay on the disk: runs of rows that lie near each other, of which a view reads few.
+r"""Gaussians that stay on the disk: runs of rows near each other, of which a view reads few.
 
 A view needs the Gaussians that reach its image. Gaussian i with centre (x, y, z) before the camera,
 largest standard deviation s and its projected radius of at most
@@ -6,15 +6,15 @@ largest standard deviation s and its projected radius of at most
 .. math:: r = 3.34 \, (s F / z + \sqrt{\text{low pass}}), \qquad
           F = \max(f_x \sqrt{1 + a^2}, f_y \sqrt{1 + b^2})
 
-pixels (EWA's Jacobian at a direction that is clamped to a, b: the view and a margin) reaches the right
-edge of an image of width w where :math:`f_x x / z + c_x - r \le w`, which for :math:`z > 0` is linear
-in the centre,
+pixels (EWA's Jacobian at a direction that is clamped to a, b: the view and a margin) reaches the
+right edge of an image of width w where :math:`f_x x / z + c_x - r \le w`, which for :math:`z > 0`
+is linear in the centre,
 
 .. math:: f_x x - (w - c_x + 3.34 \sqrt{\text{low pass}}) \, z \le 3.34 \, s F .
 
-So a chunk is not seen if no corner of the box around its centres fulfils that with the chunk's largest
-s, for one of the four edges, or if all corners are behind the near plane. What is read without need is
-culled by the backend, as in a scene in memory: the image is the same to the bit.
+So a chunk is not seen if no corner of the box around its centres fulfils that with the chunk's
+largest s, for one of the four edges, or if all corners are behind the near plane. What is read
+without need is culled by the backend, as in a scene in memory: the image is the same to the bit.
 """
 
 from collections.abc import Callable, Sequence

@@ -120,9 +120,9 @@ class Gaussians(Previewed):
     (`RenderOptions.low_pass`). Other than 3DGS's, it goes with them into PLY files."""
 
     chunks: Chunks | None = field(default=None, init=False, repr=False)
-    """Where they are on the disk: the arrays are maps of files then, and a view reads what it needs.
-    None for Gaussians in memory, and for all that is made of others: whoever changes a column or
-    takes rows has Gaussians of his own."""
+    """Where they are on the disk: the arrays are maps of files then, and a view reads what it
+    needs. None for Gaussians in memory, and for all that is made of others: whoever changes a
+    column or takes rows has Gaussians of his own."""
 
     def __post_init__(self) -> None:
         convert_fields(self)
@@ -275,6 +275,18 @@ class Gaussians(Previewed):
         arrays = {name: torch.cat([getattr(part, name) for part in parts]) for name in _ARRAYS}
         extra = {name: torch.cat([part.extra[name] for part in parts]) for name in names}
         return parts[0].replace(**arrays, extra=extra)
+
+
+def no_gaussians() -> Gaussians:
+    """None of degree 0."""
+    nothing = torch.zeros(0, 3)
+    return Gaussians(
+        means=nothing,
+        rotations=torch.zeros(0, 4),
+        scales=nothing,
+        opacities=torch.zeros(0),
+        sh=torch.zeros(0, 1, 3),
+    )
 
 
 def _device(device: torch.device | str | None) -> torch.device | None:

@@ -1,19 +1,18 @@
 """Gaussians of a scene as a folder of chunks, which commands stream (docs/formats.md).
 
     gaussians/
-      chunks.json      how many Gaussians there are, and of each chunk the rows, box and largest scale
+      chunks.json      how many Gaussians there are; of each chunk the rows, box and largest scale
       means.npy        (n, 3), rotations.npy (n, 4), scales.npy (n, 3), opacities.npy (n): float32
       sh.npy           (k, n, 3): harmonics, coefficient by coefficient, float32 or float16
       extra_0.npy ...  further columns, whose names are in chunks.json
 
-A chunk is a run of rows, and rows are ordered along a Morton curve, so that those of a chunk lie near
-each other: the largest Gaussians first, which are seen from far, then the others. One row is one
-Gaussian in all files and in the layers. The files can be mapped as they are, and a chunk is one
+A chunk is a run of rows, and rows are ordered along a Morton curve, so that those of a chunk lie
+near each other: the largest Gaussians first, which are seen from far, then the others. One row is
+one Gaussian in all files and in the layers. The files can be mapped as they are, and a chunk is one
 stretch of each: nothing is unpacked (docs/decisions/kernels.md has what that was held against).
 """
 
-import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Annotated, Any, Self
@@ -22,7 +21,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int64
 from msgspec import Meta
-from numpy.lib.format import header_data_from_array_1_0, write_array_header_1_0
+from numpy.lib.format import write_array_header_1_0
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -30,7 +29,7 @@ from splatseg.core import Gaussians
 from splatseg.core.boundary import boundary
 from splatseg.core.chunks import Chunks
 from splatseg.core.gaussians import LOW_PASS
-from splatseg.errors import FileFormatError, InputError, MissingFileError
+from splatseg.errors import InputError, MissingFileError
 from splatseg.io.arrays import ArrayHeader, read_header, read_npy
 from splatseg.io.atomic import path_inside
 from splatseg.io.foreign import expect, reading
@@ -45,11 +44,12 @@ FORMAT = "splatseg-chunks"
 VERSION = 1
 
 CHUNK_ROWS = 1 << 14
-"""Gaussians of a chunk: 2.5 MB of degree 2. Smaller ones fit a view closer and are more to look at."""
+"""Gaussians of a chunk: 2.5 MB of degree 2. Smaller ones fit a view closer and are more to look
+at."""
 
 _LARGE = 1 / 64
-"""Share of the Gaussians that stand apart because they are the largest: a chunk is seen from as far as
-its largest Gaussian."""
+"""Share of the Gaussians that stand apart because they are the largest: a chunk is seen from as far
+as its largest Gaussian."""
 
 _BLOCK = 1 << 18
 """Rows of a source that are read at once."""
@@ -175,12 +175,15 @@ class _Files:
 
     def read(self, runs: Sequence[tuple[int, int]]) -> Gaussians:
         """Rows of some runs, one run behind the other."""
-        found = {
-            name: torch.from_numpy(self._rows(name, runs))
-            for name in ("means", "rotations", "scales", "opacities", "sh")
-        }
-        self._check(found["means"].numpy(), runs)
-        return Gaussians(**found)
+        means = self._rows("means", runs)
+        self._check(means, runs)
+        return Gaussians(
+            means=torch.from_numpy(means),
+            rotations=torch.from_numpy(self._rows("rotations", runs)),
+            scales=torch.from_numpy(self._rows("scales", runs)),
+            opacities=torch.from_numpy(self._rows("opacities", runs)),
+            sh=torch.from_numpy(self._rows("sh", runs)),
+        )
 
     def _rows(self, name: str, runs: Sequence[tuple[int, int]]) -> NDArray[np.float32]:
         path = self._folder / f"{name}.npy"
@@ -226,7 +229,7 @@ def _read_runs(
 ) -> None:
     """Rows of a plane that begins at a byte; `into` has its type and room for all."""
     row = int(np.prod(into.shape[1:])) * header.dtype.itemsize
-    data, at = memoryview(into.reshape(-1).view(np.uint8)), 0
+    data, at = into.reshape(-1).view(np.uint8).data, 0
     for first, end in runs:
         file.seek(begin + first * row)
         stop = at + (end - first) * row
@@ -272,10 +275,8 @@ class ChunkWriter:
     def __enter__(self) -> Self:
         for name, (dtype, shape) in self._shapes.items():
             file = path_inside(self._folder, f"{name}.npy").open("wb")
-            empty = np.lib.stride_tricks.as_strided(np.zeros(1, dtype), shape, (0,) * len(shape))
-            write_array_header_1_0(
-                file, header_data_from_array_1_0(empty) | {"fortran_order": False}
-            )
+            header = {"descr": dtype.str, "fortran_order": False, "shape": shape}
+            write_array_header_1_0(file, header)
             offset = file.tell()
             file.truncate(offset + int(np.prod(shape)) * dtype.itemsize)
             self._files[name] = file, offset
@@ -293,6 +294,11 @@ class ChunkWriter:
             "extra": self._extra, "chunks": self._chunks,
         }  # fmt: skip
         write_json(content, self._folder / INDEX_FILE)
+
+    @property
+    def written(self) -> int:
+        """Gaussians so far."""
+        return self._written
 
     def append(self, gaussians: Gaussians) -> None:
         """Write a chunk of Gaussians, which must be of the kind that was said; none is none.
@@ -391,9 +397,9 @@ def write_chunks(
 ) -> Int64[Tensor, "n"]:
     """Order Gaussians of any source along a Morton curve and write them as chunks.
 
-    The source is read once for the order, of which 24 bytes a Gaussian stay, and then as often as it
-    takes to gather stretches of what is written that fit in the memory: always from its first row
-    to its last.
+    The source is read once for the order, of which 24 bytes a Gaussian stay, and then as often as
+    it takes to gather stretches of what is written that fit in the memory: always from its first
+    row to its last.
 
     Args:
         rows: Reads the source.
@@ -418,7 +424,7 @@ def write_chunks(
     size = sum(column[0].numel() * column.element_size() for column in columns.values())
     stretch = max(CHUNK_ROWS, memory // size // CHUNK_ROWS * CHUNK_ROWS)
     passes = 1 + -(-count // stretch)
-    step = progress or (lambda done, total: None)
+    step = progress or _unheard
     means, largest = torch.empty(count, 3), torch.empty(count)
     for start, part in _blocks(rows, count):
         part.check_values()
@@ -449,6 +455,10 @@ def write_chunks(
                 named = {n.removeprefix("extra "): own.pop(n) for n in list(own) if "extra " in n}
                 writer.append(like.replace(**own, extra=named))
     return order
+
+
+def _unheard(done: int, total: int) -> None:
+    """Nobody wants to know."""
 
 
 def _blocks(rows: Rows, count: int) -> Iterator[tuple[int, Gaussians]]:

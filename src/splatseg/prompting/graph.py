@@ -34,7 +34,8 @@ Boykov and Jolly, Interactive Graph Cuts for Optimal Boundary & Region Segmentat
 Kolmogorov and Zabih, What Energy Functions Can Be Minimized via Graph Cuts? (2004), theorem 4.1.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -46,7 +47,9 @@ from torch import Tensor
 from splatseg._check import check_shape, check_values
 from splatseg.core import Gaussians, Selection
 from splatseg.core.boundary import boundary
+from splatseg.core.chunks import Chunks
 from splatseg.core.options import Count
+from splatseg.errors import InputError
 from splatseg.lift.minimum_cut import minimum_cut
 from splatseg.lift.neighbour_graph import (
     NodeAttributes,
@@ -94,6 +97,9 @@ _BAND = 2
 _UNSURE = 0.25
 """Gaussians whose membership and its complement are both at least this are decided anew where they
 hang together with the band."""
+
+_GRAPH_BYTES = 700
+"""Of each Gaussian while its neighbours are found."""
 
 _MAX_BAND = 20_000
 """Most Gaussians that are decided anew, those nearest to the border over the graph first."""
@@ -197,6 +203,43 @@ def build_graph(gaussians: Gaussians, *, neighbours: Count = _NEIGHBOURS) -> Nei
         touching=touching(gaussians, low, high),
         mean_degree=degree if degree > 0 else 1.0,
     )
+
+
+def graph_near(gaussians: Gaussians, chunks: Chunks, mask: Bool[Tensor, "n"]) -> NeighbourGraph:
+    """The neighbours of Gaussians of some chunks and of those beside them; others have none.
+
+    Args:
+        gaussians: Gaussians on the disk.
+        chunks: Where they are.
+        mask: Gaussians whose chunks are meant.
+
+    Raises:
+        InputError: If these are more than fit in the memory.
+    """
+    from scipy.sparse import csr_matrix
+
+    near = torch.zeros(len(chunks), dtype=torch.bool)
+    for index, (first, end) in enumerate(pairwise(chunks.starts.tolist())):
+        if bool((mine := mask[first:end]).any()):
+            means = gaussians.means[first:end][mine]
+            margin = (chunks.high[index] - chunks.low[index]).median()
+            near |= chunks.around(means.amin(dim=0) - margin, means.amax(dim=0) + margin)
+    runs = chunks.runs(near)
+    needed = _GRAPH_BYTES * sum(end - first for first, end in runs)
+    if needed > chunks.memory:
+        raise InputError(
+            f"memory: neighbours of what is around the selection take about {needed / 1e9:.1f} GB, "
+            f"more than the {chunks.memory / 1e9:.1f} GB that were allowed; allow more, or select "
+            "with post_processing none."
+        )
+    local, rows = build_graph(chunks.read(runs)), chunks.rows(near).numpy()
+    matrix, count = local.strengths, len(gaussians)
+    sizes = np.zeros(count, np.int32)
+    sizes[rows] = np.diff(matrix.indptr)
+    ends = np.concatenate(([0], np.cumsum(sizes, dtype=np.int32)), dtype=np.int32)
+    indices = rows.astype(np.int32)[matrix.indices]
+    strengths: Any = csr_matrix((matrix.data, indices, ends), shape=(count, count))
+    return replace(local, strengths=strengths)
 
 
 def holes(graph: NeighbourGraph, selection: Selection) -> Selection:

@@ -41,6 +41,7 @@ from splatseg.prompting.graph import (
     build_graph,
     complete_membership,
     graph_cut,
+    graph_near,
     holes,
     specks,
 )
@@ -140,6 +141,16 @@ class SceneIndex:
         if self._graph is None:
             self._graph = build_graph(self._gaussians)
         return self._graph
+
+    def graph_around(self, mask: Bool[Tensor, "n"]) -> NeighbourGraph:
+        """The graph, as far as it is needed for what is decided at some Gaussians.
+
+        Of Gaussians on the disk, neighbours of those of the chunks that have some of the mask, and
+        of the chunks that lie as near to these as a chunk is wide; others have none. What is
+        farther away and has one of these among its own nearest is not known to.
+        """
+        chunks = self._gaussians.chunks
+        return self.graph if chunks is None else graph_near(self._gaussians, chunks, mask)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -294,9 +305,8 @@ def filtered(confidence: Float[Tensor, "n"], context: SelectionContext) -> Float
         return _with_mask(confidence, kept)
     selection = Selection(mask=mask)
     clicked = context.pointed_at(positive=True) & selection
-    return _with_mask(
-        confidence, mask & ~specks(context.neighbours.graph, selection, clicked=clicked).mask
-    )
+    graph = context.neighbours.graph_around(mask)
+    return _with_mask(confidence, mask & ~specks(graph, selection, clicked=clicked).mask)
 
 
 def grown(confidence: Float[Tensor, "n"], context: SelectionContext) -> Float[Tensor, "n"]:
@@ -325,7 +335,8 @@ def refined(confidence: Float[Tensor, "n"], context: SelectionContext) -> Float[
 def filled(confidence: Float[Tensor, "n"], context: SelectionContext) -> Float[Tensor, "n"]:
     """Without holes; what a negative prompt shows is none."""
     selection = Selection(mask=confidence > 0.5)
-    found = holes(context.neighbours.graph, selection) - context.pointed_at(positive=False)
+    graph = context.neighbours.graph_around(selection.mask)
+    found = holes(graph, selection) - context.pointed_at(positive=False)
     return _with_mask(confidence, selection.mask | found.mask)
 
 

@@ -1,7 +1,7 @@
 """W of a view that has only some of a scene's Gaussians: its columns at their rows of the scene.
 
-With S the matrix that takes the rows that are there, everything is a product with :math:`W S`: signals
-are taken by rows, and what comes back is put at them, with nothing at the others.
+With S the matrix that takes the rows that are there, everything is a product with :math:`W S`:
+signals are taken by rows, and what comes back is put at them, with nothing at the others.
 """
 
 from collections.abc import Sequence
@@ -83,16 +83,15 @@ class RowsView(BackendView):
     def argmax(self, signal: SparseSignal, background: int) -> StrongestChannels:
         """The largest channel of ``W S signal``."""
         values = None if signal.values is None else signal.values[self._rows]
-        own = SparseSignal(
-            channels=signal.channels[self._rows], values=values, count=signal.count
-        )
+        own = SparseSignal(channels=signal.channels[self._rows], values=values, count=signal.count)
         return self._inner.argmax(own, background)
 
     def contributors(self, pixels: Int[Tensor, "p 2"], k: int) -> Contributors:
         """The k strongest Gaussians of pixels, by their rows of the scene."""
         found = self._inner.contributors(pixels, k)
         return replace(
-            found, **{name: self._named(getattr(found, name)) for name in ("ids", "first", "median")}
+            found,
+            **{name: self._named(getattr(found, name)) for name in ("ids", "first", "median")},
         )
 
     def rows(self, pixels: Int[Tensor, "p 2"] | None, k: int | None) -> SparseWeights:

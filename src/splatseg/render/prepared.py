@@ -152,8 +152,10 @@ class PreparedView:
 
     @property
     def part(self) -> ViewPart | None:
-        """Of a scene on the disk the view of what was read: work that goes with the Gaussians of
-        a view, and not with those of the scene, is done there. None where all are in memory."""
+        """Of a scene on the disk the view of what was read; None where all are in memory.
+
+        Work that goes with the Gaussians of a view, and not with those of the scene, is done there.
+        """
         return self._part
 
     @property

@@ -48,7 +48,14 @@ from splatseg.lift import GaussianField
 from splatseg.render import BackendName
 from splatseg.report.colours import colour_labels, layer_colours, legend_of
 from splatseg.report.images import colour_depth
-from splatseg.tasks.work import SILENT, Observer, Work, check_parent_writable, scene_of_capture
+from splatseg.tasks.work import (
+    SILENT,
+    Observer,
+    Work,
+    check_parent_writable,
+    check_streams,
+    scene_of_capture,
+)
 
 # Depths beyond these shares of all are shown in the end colours.
 _NEAR, _FAR = 0.01, 0.99
@@ -210,6 +217,8 @@ def render_views(
         InputError: If there is no such layer or split, or something else lies in the way.
     """
     options = options or RenderingOptions()
+    if executor is not LOCAL:
+        check_streams(scene, "executor")
     work = Work(scene=scene, layers=layers, backend=backend, observer=observer)
     if not options.what:
         raise InputError("what: expected rgb, depth, alpha or names of layers, got nothing.")
