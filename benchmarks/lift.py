@@ -106,7 +106,7 @@ def features(made: Made) -> str:
 
 def labels(made: Made) -> str:
     """More ids than any table holds."""
-    options = UpliftOptions(memory=1 << 28, candidates=4)
+    options = UpliftOptions(table_memory=1 << 28, candidates=4)
     found = uplift(room(GAUSSIANS, 0), made.views, made, options=options)
     seen = int((found.ids >= 0).sum())
     return f"{IDS * len(made.views)} ids onto {GAUSSIANS} Gaussians, {seen} labelled"

@@ -97,8 +97,6 @@ class Command(OnViews):
     )
     """How a stopped training goes on."""
 
-    memory: Memory = None
-
     options: Any = None
     """Options of the method."""
 
@@ -120,6 +118,8 @@ def command_for(words: Sequence[str]) -> type[Any]:
         tyro.conf.arg(help=f"Options of method {name}: {method.summary} ({method.reference})."),
     ]
     own: list[tuple[str, Any, Any]] = [("options", options, field(default=default))]
+    if method.camera is not None:
+        own.append(("memory", Memory, field(default=None)))
     if method.published_differs:
         own.append(_shared_with(method.published_differs))
     made = make_dataclass(
@@ -162,7 +162,8 @@ def run(command: Command) -> None:
     """Segment a scene."""
     started = time.monotonic()
     observer = command.observer
-    scene = command.open_streamed(command.memory)
+    # Of a method that streams; trainings have a memory of another kind among their options.
+    scene = command.open_streamed(getattr(command, "memory", None))
     if command.report:
         check_streams(scene, "--report")
     opened = time.monotonic() - started

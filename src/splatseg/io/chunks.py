@@ -275,7 +275,7 @@ class ChunkWriter:
     def __enter__(self) -> Self:
         for name, (dtype, shape) in self._shapes.items():
             file = path_inside(self._folder, f"{name}.npy").open("wb")
-            header = {"descr": dtype.str, "fortran_order": False, "shape": shape}
+            header: dict[str, Any] = {"descr": dtype.str, "fortran_order": False, "shape": shape}
             write_array_header_1_0(file, header)
             offset = file.tell()
             file.truncate(offset + int(np.prod(shape)) * dtype.itemsize)
@@ -283,7 +283,7 @@ class ChunkWriter:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        for file, _ in self._files.values():
+        for file, _offset in self._files.values():
             file.close()
         if kind is not None:
             return

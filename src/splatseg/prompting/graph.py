@@ -98,6 +98,9 @@ _UNSURE = 0.25
 """Gaussians whose membership and its complement are both at least this are decided anew where they
 hang together with the band."""
 
+_MARGIN = 0.25
+"""Of what a chunk is usually wide, by which neighbours are looked for around a selection."""
+
 _GRAPH_BYTES = 700
 """Of each Gaussian while its neighbours are found."""
 
@@ -206,38 +209,48 @@ def build_graph(gaussians: Gaussians, *, neighbours: Count = _NEIGHBOURS) -> Nei
 
 
 def graph_near(gaussians: Gaussians, chunks: Chunks, mask: Bool[Tensor, "n"]) -> NeighbourGraph:
-    """The neighbours of Gaussians of some chunks and of those beside them; others have none.
+    """The neighbours of what is near some Gaussians on the disk; others have none.
+
+    Near is what lies in the box around those of a chunk, with a margin of a quarter of what a chunk
+    is usually wide: some ten times as far as nearest neighbours are.
 
     Args:
         gaussians: Gaussians on the disk.
         chunks: Where they are.
-        mask: Gaussians whose chunks are meant.
+        mask: The Gaussians.
 
     Raises:
-        InputError: If these are more than fit in the memory.
+        InputError: If they are more than fit in the memory.
     """
     from scipy.sparse import csr_matrix
 
-    near = torch.zeros(len(chunks), dtype=torch.bool)
-    for index, (first, end) in enumerate(pairwise(chunks.starts.tolist())):
+    margin = _MARGIN * (chunks.high - chunks.low).median(dim=1).values.median()
+    boxes: list[tuple[Tensor, Tensor]] = []
+    chosen = torch.zeros(len(chunks), dtype=torch.bool)
+    for first, end in pairwise(chunks.starts.tolist()):
         if bool((mine := mask[first:end]).any()):
             means = gaussians.means[first:end][mine]
-            margin = (chunks.high[index] - chunks.low[index]).median()
-            near |= chunks.around(means.amin(dim=0) - margin, means.amax(dim=0) + margin)
-    runs = chunks.runs(near)
-    needed = _GRAPH_BYTES * sum(end - first for first, end in runs)
+            boxes.append((means.amin(dim=0) - margin, means.amax(dim=0) + margin))
+            chosen |= chunks.around(*boxes[-1])
+    rows = chunks.rows(chosen)
+    near = torch.zeros(len(rows), dtype=torch.bool)
+    means = gaussians.means[rows]
+    for low, high in boxes:
+        near |= ((means >= low) & (means <= high)).all(dim=1)
+    needed = _GRAPH_BYTES * int(near.sum())
     if needed > chunks.memory:
         raise InputError(
             f"memory: neighbours of what is around the selection take about {needed / 1e9:.1f} GB, "
             f"more than the {chunks.memory / 1e9:.1f} GB that were allowed; allow more, or select "
             "with post_processing none."
         )
-    local, rows = build_graph(chunks.read(runs)), chunks.rows(near).numpy()
+    rows = rows[near]
+    local = build_graph(gaussians[rows])
     matrix, count = local.strengths, len(gaussians)
     sizes = np.zeros(count, np.int32)
-    sizes[rows] = np.diff(matrix.indptr)
+    sizes[rows.numpy()] = np.diff(matrix.indptr)
     ends = np.concatenate(([0], np.cumsum(sizes, dtype=np.int32)), dtype=np.int32)
-    indices = rows.astype(np.int32)[matrix.indices]
+    indices = rows.int().numpy()[matrix.indices]
     strengths: Any = csr_matrix((matrix.data, indices, ends), shape=(count, count))
     return replace(local, strengths=strengths)
 

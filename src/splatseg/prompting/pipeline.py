@@ -127,6 +127,7 @@ class SceneIndex:
         self._gaussians = gaussians
         self._index: NeighbourIndex | None = None
         self._graph: NeighbourGraph | None = None
+        self._near: tuple[Tensor, NeighbourGraph] | None = None
 
     @property
     def index(self) -> NeighbourIndex:
@@ -145,12 +146,15 @@ class SceneIndex:
     def graph_around(self, mask: Bool[Tensor, "n"]) -> NeighbourGraph:
         """The graph, as far as it is needed for what is decided at some Gaussians.
 
-        Of Gaussians on the disk, neighbours of those of the chunks that have some of the mask, and
-        of the chunks that lie as near to these as a chunk is wide; others have none. What is
-        farther away and has one of these among its own nearest is not known to.
+        Of Gaussians on the disk it has those around them (`graph_near`), and others have no
+        neighbours: what is farther away and has one of these among its own nearest is not known to.
         """
         chunks = self._gaussians.chunks
-        return self.graph if chunks is None else graph_near(self._gaussians, chunks, mask)
+        if chunks is None:
+            return self.graph
+        if self._near is None or bool((mask & ~self._near[0]).any()):
+            self._near = mask, graph_near(self._gaussians, chunks, mask)
+        return self._near[1]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
