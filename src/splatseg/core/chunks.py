@@ -17,9 +17,9 @@ largest s, for one of the four edges, or if all corners are behind the near plan
 without need is culled by the backend, as in a scene in memory: the image is the same to the bit.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import torch
 from jaxtyping import Bool, Float, Int64
@@ -44,6 +44,14 @@ _VIEW_BYTES = 170
 """Of each Gaussian of a view in the kernels: projected twice, keys of the sort, its row."""
 
 
+class ReadRows(Protocol):
+    """Reads runs of rows, from one to before another, one behind the other."""
+
+    def __call__(self, runs: Sequence[tuple[int, int]], *, colours: bool = True) -> "Gaussians":
+        """Float32, without extra columns; without `colours` all harmonics are 0, of degree 0."""
+        ...
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Chunks:
     """Runs of rows of Gaussians on the disk, and where they lie."""
@@ -63,16 +71,21 @@ class Chunks:
     memory: int
     """Bytes that Gaussians of a view and what the kernels make of them may take."""
 
-    read: "Callable[[Sequence[tuple[int, int]]], Gaussians]"
-    """Reads runs of rows, from one to before another, one behind the other; float32, without extra
-    columns."""
+    read: "ReadRows"
+    """Reads runs of rows."""
 
     def __len__(self) -> int:
         return len(self.low)
 
+    def blocks(self, size: int) -> Iterator[tuple[int, int]]:
+        """All rows as runs of at most this many."""
+        count = int(self.starts[-1])
+        for first in range(0, count, size):
+            yield first, min(first + size, count)
+
     def rows(self, chosen: Bool[Tensor, "chunks"]) -> Int64[Tensor, "m"]:
         """The rows of some chunks, ascending."""
-        return torch.cat([torch.arange(0), *(torch.arange(*run) for run in self.runs(chosen))])
+        return rows_of(self.runs(chosen))
 
     def runs(self, chosen: Bool[Tensor, "chunks"]) -> list[tuple[int, int]]:
         """The rows of some chunks as runs, each as long as it can be."""
@@ -117,8 +130,8 @@ class Chunks:
 
     def view_of(
         self, camera: Camera, *, near: float, low_pass: float, coefficients: int
-    ) -> "tuple[Gaussians, Int64[Tensor, 'm']]":
-        """The Gaussians that a pinhole camera may see, read, and their rows.
+    ) -> list[tuple[int, int]]:
+        """The runs of rows that a pinhole camera may see.
 
         Args:
             camera: The camera.
@@ -136,11 +149,15 @@ class Chunks:
             raise InputError(
                 f"memory: a view has {count} Gaussians before it, which take about "
                 f"{needed / 1e9:.1f} GB, more than the {self.memory / 1e9:.1f} GB that were "
-                "allowed; allow more, or draw a coarser level."
+                "allowed; allow more."
             )
-        rows = torch.cat([torch.arange(0), *(torch.arange(*run) for run in runs)])
-        return self.read(runs), rows
+        return runs
 
     def around(self, low: Float[Tensor, "3"], high: Float[Tensor, "3"]) -> Bool[Tensor, "chunks"]:
         """Which chunks have centres in a box, or may have."""
         return ((self.low <= high) & (self.high >= low)).all(dim=1)
+
+
+def rows_of(runs: Sequence[tuple[int, int]]) -> Int64[Tensor, "m"]:
+    """The rows of some runs, one run behind the other."""
+    return torch.cat([torch.arange(0), *(torch.arange(*run) for run in runs)])

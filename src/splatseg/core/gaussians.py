@@ -27,6 +27,9 @@ from splatseg.core.sh import SH_C0, degree_of, rotate_sh
 from splatseg.core.upward import Previewed
 from splatseg.errors import InputError, RangeError, ShapeError
 
+_COLOURS = 1 << 20
+"""Gaussians on the disk whose colours are read at once."""
+
 _BLOCK = 1 << 15
 """Values converted at once: the float64 copies stay in the processor's cache."""
 
@@ -158,6 +161,10 @@ class Gaussians(Previewed):
     @property
     def colours(self) -> Float[Tensor, "n 3"]:
         """The mean colour over directions (degree 0), not clamped."""
+        if self.chunks is not None:
+            # Harmonics lie side by side: looked at in the map, all of them would stay.
+            parts = [self.chunks.read([run]).sh[:, 0] for run in self.chunks.blocks(_COLOURS)]
+            return 0.5 + SH_C0 * torch.cat([self.sh[:0, 0].float(), *parts])
         return 0.5 + SH_C0 * self.sh[:, 0]
 
     @property

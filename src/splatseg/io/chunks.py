@@ -3,7 +3,7 @@
     gaussians/
       chunks.json      how many Gaussians there are; of each chunk the rows, box and largest scale
       means.npy        (n, 3), rotations.npy (n, 4), scales.npy (n, 3), opacities.npy (n): float32
-      sh.npy           (k, n, 3): harmonics, coefficient by coefficient, float32 or float16
+      sh.npy           (n, k, 3): harmonics of k coefficients a channel, float32 or float16
       extra_0.npy ...  further columns, whose names are in chunks.json
 
 A chunk is a run of rows, and rows are ordered along a Morton curve, so that those of a chunk lie
@@ -12,8 +12,10 @@ one Gaussian in all files and in the layers. The files can be mapped as they are
 stretch of each: nothing is unpacked (docs/decisions/kernels.md has what that was held against).
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import IO, Annotated, Any, Self
 
@@ -50,6 +52,9 @@ at."""
 _LARGE = 1 / 64
 """Share of the Gaussians that stand apart because they are the largest: a chunk is seen from as far
 as its largest Gaussian."""
+
+_MAX_HALF = 65504.0
+"""Largest number of half precision."""
 
 _BLOCK = 1 << 18
 """Rows of a source that are read at once."""
@@ -113,7 +118,7 @@ def open_chunks(folder: Path, *, memory: int) -> Gaussians:
     rotations = _column(folder, "rotations", (count, 4))
     scales = _column(folder, "scales", (count, 3))
     opacities = _column(folder, "opacities", (count,))
-    sh = _column(folder, "sh", (None, count, 3), half=True)
+    sh = _column(folder, "sh", (count, None, 3), half=True)
     extra: dict[str, Tensor] = {}
     for number, name in enumerate(index.extra):
         file = folder / f"extra_{number}.npy"
@@ -122,13 +127,13 @@ def open_chunks(folder: Path, *, memory: int) -> Gaussians:
         expect(column.ndim in (1, 2) and len(column) == count, file, what)
         extra[name] = torch.from_numpy(column)
     starts = np.cumsum([0, *(chunk.rows for chunk in index.chunks)])
-    files = _Files(folder, [(chunk.low, chunk.high) for chunk in index.chunks], starts)
+    files = _Files(folder, index, starts)
     gaussians = Gaussians(
         means=torch.from_numpy(means),
         rotations=torch.from_numpy(rotations),
         scales=torch.from_numpy(scales),
         opacities=torch.from_numpy(opacities),
-        sh=torch.from_numpy(sh).permute(1, 0, 2),
+        sh=torch.from_numpy(sh),
         extra=extra,
         antialiased=index.antialiased,
         low_pass=index.low_pass,
@@ -139,9 +144,7 @@ def open_chunks(folder: Path, *, memory: int) -> Gaussians:
         high=torch.tensor([chunk.high for chunk in index.chunks]).reshape(-1, 3),
         largest=torch.tensor([chunk.largest for chunk in index.chunks]),
         memory=memory,
-        read=lambda runs: files.read(runs).replace(
-            antialiased=index.antialiased, low_pass=index.low_pass
-        ),
+        read=files.read,
     )
     return gaussians.in_chunks(chunks)
 
@@ -166,15 +169,11 @@ def _column(
 class _Files:
     """Reads runs of rows out of the files into memory of its own: pages of maps would stay."""
 
-    def __init__(
-        self, folder: Path, boxes: Sequence[tuple[Any, Any]], starts: NDArray[np.int64]
-    ) -> None:
-        self._folder = folder
-        self._boxes = boxes
-        self._starts = starts
+    def __init__(self, folder: Path, index: _Index, starts: NDArray[np.int64]) -> None:
+        self._folder, self._about, self._starts = folder, index, starts
 
-    def read(self, runs: Sequence[tuple[int, int]]) -> Gaussians:
-        """Rows of some runs, one run behind the other."""
+    def read(self, runs: Sequence[tuple[int, int]], *, colours: bool = True) -> Gaussians:
+        """Rows of some runs, one run behind the other; see `core.chunks.ReadRows`."""
         means = self._rows("means", runs)
         self._check(means, runs)
         return Gaussians(
@@ -182,26 +181,33 @@ class _Files:
             rotations=torch.from_numpy(self._rows("rotations", runs)),
             scales=torch.from_numpy(self._rows("scales", runs)),
             opacities=torch.from_numpy(self._rows("opacities", runs)),
-            sh=torch.from_numpy(self._rows("sh", runs)),
+            sh=torch.from_numpy(self._rows("sh", runs))
+            if colours
+            else torch.zeros(1, 1, 3).expand(len(means), 1, 3),
+            antialiased=self._about.antialiased,
+            low_pass=self._about.low_pass,
         )
 
     def _rows(self, name: str, runs: Sequence[tuple[int, int]]) -> NDArray[np.float32]:
-        path = self._folder / f"{name}.npy"
-        count = sum(end - first for first, end in runs)
-        with reading(path, "an array of NumPy"), path.open("rb") as file:
-            header = read_header(file, size=path.stat().st_size, where=path)
-            if name != "sh":
-                values = np.empty((count, *header.shape[1:]), np.float32)
-                _read_runs(file, header, header.offset, runs, values)
-                return values
-            coefficients, rows = header.shape[:2]
-            values = np.empty((count, coefficients, 3), np.float32)
-            plane = np.empty((count, 3), header.dtype)
-            for k in range(coefficients):
-                begin = header.offset + k * rows * 3 * header.dtype.itemsize
-                _read_runs(file, header, begin, runs, plane)
-                values[:, k] = plane
+        with self._opened(name) as (file, header):
+            count = sum(end - first for first, end in runs)
+            values, at = np.empty((count, *header.shape[1:]), np.float32), 0
+            for first, end in runs:
+                into = values[at : at + end - first]
+                if header.dtype == values.dtype:
+                    _read_rows(file, header, first, into)
+                else:
+                    half = np.empty(into.shape, header.dtype)
+                    _read_rows(file, header, first, half)
+                    into[:] = half
+                at += end - first
             return values
+
+    @contextmanager
+    def _opened(self, name: str) -> Generator[tuple[IO[bytes], ArrayHeader]]:
+        path = self._folder / f"{name}.npy"
+        with reading(path, "an array of NumPy"), path.open("rb", buffering=0) as file:
+            yield file, read_header(file, size=path.stat().st_size, where=path)
 
     def _check(self, means: NDArray[np.float32], runs: Sequence[tuple[int, int]]) -> None:
         """The index must say where they are, or views would miss some."""
@@ -213,31 +219,23 @@ class _Files:
             ):
                 begin, stop = max(first, self._starts[chunk]), min(end, self._starts[chunk + 1])
                 own = means[at + begin - first : at + stop - first]
-                low, high = (np.array(corner, np.float32) for corner in self._boxes[chunk])
+                box = self._about.chunks[chunk]
+                low, high = np.array(box.low, np.float32), np.array(box.high, np.float32)
                 inside = bool((own >= low).all() and (own <= high).all())
                 what = f"the box of chunk {chunk} to hold its Gaussians, got some outside"
                 expect(inside, self._folder / INDEX_FILE, what)
             at += end - first
 
 
-def _read_runs(
-    file: IO[bytes],
-    header: ArrayHeader,
-    begin: int,
-    runs: Sequence[tuple[int, int]],
-    into: NDArray[Any],
-) -> None:
-    """Rows of a plane that begins at a byte; `into` has its type and room for all."""
-    row = int(np.prod(into.shape[1:])) * header.dtype.itemsize
+def _read_rows(file: IO[bytes], header: ArrayHeader, first: int, into: NDArray[Any]) -> None:
+    """Rows of numbers of the header's type from one on; `into` is contiguous and says how many."""
     data, at = into.reshape(-1).view(np.uint8).data, 0
-    for first, end in runs:
-        file.seek(begin + first * row)
-        stop = at + (end - first) * row
-        while at < stop:
-            step = file.readinto(data[at:stop])  # type: ignore[attr-defined]
-            if not step:
-                raise EOFError(f"it ends before row {end}")
-            at += step
+    file.seek(header.offset + first * int(np.prod(into.shape[1:])) * header.dtype.itemsize)
+    while at < len(data):
+        step = file.readinto(data[at:])  # type: ignore[attr-defined]
+        if not step:
+            raise EOFError(f"it ends after {at} of {len(data)} bytes")
+        at += step
 
 
 class ChunkWriter:
@@ -267,7 +265,7 @@ class ChunkWriter:
             name: (np.dtype("<f4"), (count, *getattr(like, name).shape[1:]))
             for name in ("means", "rotations", "scales", "opacities")
         }
-        shapes["sh"] = self._half, (like.sh.shape[1], count, 3)
+        shapes["sh"] = self._half, (count, *like.sh.shape[1:])
         for number, column in enumerate(like.extra.values()):
             shapes[f"extra_{number}"] = column.numpy().dtype, (count, *column.shape[1:])
         self._shapes = shapes
@@ -313,10 +311,9 @@ class ChunkWriter:
         for name in ("means", "rotations", "scales", "opacities"):
             self._put(name, self._written, getattr(gaussians, name).numpy())
         sh = gaussians.sh.numpy()
-        if self._half.itemsize == 2 and float(np.abs(sh).max()) > np.finfo(np.float16).max:
+        if self._half.itemsize == 2 and float(np.abs(sh).max()) > _MAX_HALF:
             raise InputError("sh: expected harmonics that float16 can hold, got larger ones.")
-        for k in range(sh.shape[1]):
-            self._put("sh", k * self._count + self._written, sh[:, k])
+        self._put("sh", self._written, sh)
         for number, name in enumerate(self._extra):
             self._put(f"extra_{number}", self._written, gaussians.extra[name].numpy())
         self._written += len(gaussians)
@@ -422,23 +419,23 @@ def write_chunks(
     columns = {name: getattr(like, name) for name in ("means", "rotations", "scales", "opacities")}
     columns |= {"sh": like.sh} | {f"extra {name}": c for name, c in like.extra.items()}
     size = sum(column[0].numel() * column.element_size() for column in columns.values())
-    stretch = max(CHUNK_ROWS, memory // size // CHUNK_ROWS * CHUNK_ROWS)
-    passes = 1 + -(-count // stretch)
     step = progress or _unheard
     means, largest = torch.empty(count, 3), torch.empty(count)
     for start, part in _blocks(rows, count):
         part.check_values()
         means[start : start + len(part)] = part.means
         largest[start : start + len(part)] = part.scales.amax(dim=1)
-        step(start + len(part), passes * count)
+        step(start + len(part), 2 * count)
     order, apart = morton_order(means, largest)
     del means, largest
+    stretches = list(_stretches(count, apart, memory // size))
+    total = (1 + len(stretches)) * count
     place = torch.empty_like(order)
     place[order] = torch.arange(count)
     done = count
     with ChunkWriter(folder, count, like=like, half=half) as writer:
-        for first in range(0, count, stretch):
-            end = min(count, first + stretch)
+        for cuts in stretches:
+            first, end = cuts[0], cuts[-1]
             room = {name: c.new_empty((end - first, *c.shape[1:])) for name, c in columns.items()}
             for start, part in _blocks(rows, count):
                 here = place[start : start + len(part)]
@@ -449,8 +446,8 @@ def write_chunks(
                     own = part.extra[extra] if extra != name else getattr(part, name)
                     column[into] = own[mine]
                 done += len(part)
-                step(done, passes * count)
-            for begin, stop in _cuts(first, end, apart):
+                step(done, total)
+            for begin, stop in pairwise(cuts):
                 own = {name: c[begin - first : stop - first] for name, c in room.items()}
                 named = {n.removeprefix("extra "): own.pop(n) for n in list(own) if "extra " in n}
                 writer.append(like.replace(**own, extra=named))
@@ -467,11 +464,16 @@ def _blocks(rows: Rows, count: int) -> Iterator[tuple[int, Gaussians]]:
         yield start, rows(start, min(count, start + _BLOCK))
 
 
-def _cuts(first: int, end: int, apart: int) -> Iterator[tuple[int, int]]:
-    """Chunks of a stretch, none of which has both Gaussians that stand apart and others."""
-    while first < end:
-        stop = min(end, first + CHUNK_ROWS)
-        if first < apart < stop:
-            stop = apart
-        yield first, stop
-        first = stop
+def _stretches(count: int, apart: int, most: int) -> Iterator[list[int]]:
+    """Where chunks begin and end, those of a stretch together: so many rows, or one chunk.
+
+    No chunk has both Gaussians that stand apart and others.
+    """
+    begin = [*range(0, apart, CHUNK_ROWS), *range(apart, count, CHUNK_ROWS)]
+    cuts = [begin[0]]
+    for end in [*begin[1:], count]:
+        if len(cuts) > 1 and end - cuts[0] > most:
+            yield cuts
+            cuts = [cuts[-1]]
+        cuts.append(end)
+    yield cuts

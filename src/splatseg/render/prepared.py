@@ -5,8 +5,8 @@ For a camera with distortion the view is the product of two sparse matrices, :ma
 identity and nothing is resampled. The warp depends on the lens alone and is kept by itself.
 """
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple, Self
+from collections.abc import Callable, Sequence
+from typing import Any, Self
 
 import torch
 from jaxtyping import Bool, Float, Int, Int64, UInt8
@@ -15,6 +15,7 @@ from torch import Tensor
 from splatseg._check import check_shape
 from splatseg.core import Camera, Gaussians
 from splatseg.core.boundary import boundary
+from splatseg.core.chunks import rows_of
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.render._backend import (
     Backend,
@@ -84,26 +85,51 @@ def prepare(
         check_scene(gaussians)
     chosen = get_backend(backend, like=gaussians.means)
     options = options or options_for(gaussians, backend)
-    if gaussians.chunks is None:
+    chunks = gaussians.chunks
+    if chunks is None:
         return PreparedView(gaussians, camera, options=options, backend=chosen)
-    near, rows = gaussians.chunks.view_of(
+    runs = chunks.view_of(
         undistorted_camera(camera),
         near=options.near,
         low_pass=options.low_pass,
         coefficients=gaussians.sh.shape[1],
     )
-    check_scene(near)
-    part = ViewPart(PreparedView(near, camera, options=options, backend=chosen), rows)
+
+    def read(colours: bool) -> PreparedView:
+        near = chunks.read(runs, colours=colours)
+        check_scene(near)
+        return PreparedView(near, camera, options=options, backend=chosen)
+
+    part = ViewPart(rows_of(runs), read)
     return PreparedView(gaussians, camera, options=options, backend=chosen, part=part)
 
 
-class ViewPart(NamedTuple):
-    """A view of the Gaussians that were read from the disk for it."""
+class ViewPart:
+    """A view of the Gaussians that are read from the disk for it, when they are first needed.
 
-    view: "PreparedView"
+    Args:
+        rows: Which row of the scene each of its Gaussians is, ascending.
+        read: Makes the view, with colours or without; harmonics are most of what there is to read.
+    """
 
-    rows: Int64[Tensor, "m"]
-    """Which row of the scene each of its Gaussians is, ascending."""
+    def __init__(self, rows: Int64[Tensor, "m"], read: "Callable[[bool], PreparedView]") -> None:
+        self.rows = rows
+        self._read = read
+        self._view: PreparedView | None = None
+        self._coloured = False
+
+    def view(self, *, colours: bool = False) -> "PreparedView":
+        """The view, which stays open; without `colours` the Gaussians may have none."""
+        if self._view is None or (colours and not self._coloured):
+            self.close()
+            self._view, self._coloured = self._read(colours), colours
+        return self._view
+
+    def close(self) -> None:
+        """Release its memory."""
+        if self._view is not None:
+            self._view.close()
+            self._view = None
 
 
 class PreparedView:
@@ -129,7 +155,7 @@ class PreparedView:
         self._view: BackendView = (
             backend.prepare(gaussians, pinhole, options=options)
             if part is None
-            else RowsView(part.view.own, part.rows, count=len(gaussians), camera=pinhole)
+            else RowsView(part, count=len(gaussians), camera=pinhole)
         )
         self._shown: tuple[Tensor, BackendView] | None = None
 
@@ -245,7 +271,8 @@ class PreparedView:
                 None if column is None else column[self._part.rows]
                 for column in (tint, signal, shown)
             )
-            return self._part.view.picture(tint, signal=signal, shown=shown)
+            view = self._part.view(colours=signal is None)
+            return view.picture(tint, signal=signal, shown=shown)
         view, gaussians = self._view, self._gaussians
         if shown is not None and not bool(shown.all()):
             gaussians = without_hidden(gaussians, shown)
