@@ -38,7 +38,7 @@ def camera(**changes: float) -> Camera:
 
 @given(seed=st.integers(0, 2**32 - 1), low_pass=st.sampled_from([0.0, 0.3, 4.0]))
 def test_no_gaussian_with_a_weight_is_in_a_chunk_that_is_not_seen(seed, low_pass) -> None:
-    """Centres all around the edges of the view, near planes and behind; scales from tiny to huge."""
+    """Centres all around the edges of the view, near it and behind; scales from tiny to huge."""
     generator = torch.Generator().manual_seed(seed)
 
     def uniform(low: float, high: float, *shape: int) -> torch.Tensor:

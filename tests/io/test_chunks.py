@@ -1,6 +1,8 @@
 """Gaussians in chunks on the disk: what is written comes back, and what is damaged is told."""
 
 import json
+from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -141,13 +143,18 @@ def test_the_source_must_be_renderable_and_not_empty(gaussians, tmp_path) -> Non
         write_chunks(lambda a, b: bad[a:b], 300, tmp_path, memory=10**9)
     with pytest.raises(InputError, match="at least one"):
         write_chunks(lambda a, b: bad[a:b], 0, tmp_path, memory=10**9)
-    with (
-        pytest.raises(InputError, match="expected 300 Gaussians, got 7"),
-        ChunkWriter(tmp_path, 300, like=gaussians) as writer,
-    ):
-        writer.append(gaussians[:0])
-        writer.append(gaussians[:7])
+    parts = [gaussians[:0], gaussians[:7]]
+    with pytest.raises(InputError, match="expected 300 Gaussians, got 7"):
+        write_parts(tmp_path, parts, 300)
     assert not (tmp_path / "chunks.json").exists()
+    write_parts(tmp_path, parts, 7)
+    assert len(open_chunks(tmp_path, memory=1).chunks or ()) == 1, "none is no chunk"
+
+
+def write_parts(folder: Path, parts: Sequence[Gaussians], count: int) -> None:
+    with ChunkWriter(folder, count, like=parts[0]) as writer:
+        for part in parts:
+            writer.append(part)
 
 
 def truncate(path) -> None:
