@@ -3,9 +3,9 @@
     python benchmarks/chunks.py SCENE FOLDER [--tiles 106] [--memory 8GB] [--formats]
 
 SCENE is a fit of the office. Its Gaussians are laid out in tiles side by side, 106 of them are
-20 M, and each tile has ids of its own: its number times 100 and the class of a lift of the office. Views,
-photographs and class maps are the office's own, in the tile in the middle. FOLDER gets the scene in
-chunks and all that is made of it, 20 GB for 106 tiles; nothing in it is removed.
+20 M, and each tile has ids of its own: its number times 100 and the class of a lift of the office.
+Views, photographs and class maps are the office's own, in the tile in the middle. FOLDER gets the
+scene in chunks and all that is made of it, 20 GB for 106 tiles; nothing in it is removed.
 
 Every step is a command in a process of its own; what counts is the wall, CPU time, and the peak of
 resident memory, files that are mapped included. `--formats` measures instead what else chunks could
@@ -75,7 +75,7 @@ def make(scene: Scene, folder: Path, tiles: int, memory: int) -> None:
         ids = torch.where(own_class == UNLABELLED, UNLABELLED, 100 * (tile + 1) + own_class)
         return [("tiles", Labels(ids=ids.int(), confidence=torch.ones(count), info=LayerInfo()))]
 
-    save_scene_in_chunks(scene, folder, GaussiansToWrite(count=count, write=write), layers=layers)
+    save_scene_in_chunks(scene, GaussiansToWrite(count=count, write=write), folder, layers=layers)
 
 
 def middle(scene: Scene, tiles: int) -> Scene:

@@ -69,7 +69,7 @@ def test_a_command_streams_within_the_memory(chunked, tmp_path, capsys, monkeypa
         monkeypatch.setattr(f"splatseg.io.{module}.open_chunks", watched)
     words = line(STREAMED[name], CHUNKED=chunked, HERE=tmp_path)
     assert main([*words, "--memory", "900kB"]) == 0
-    assert set(seen) == {900_000}
+    assert set(seen) - {1} == {900_000}, "1 is to look at what was written"
     assert "error" in failed(capsys, *words, "--memory", "much")
     assert "--memory: expected more than nothing" in failed(capsys, *words, "--memory", "0")
 
@@ -133,9 +133,30 @@ def test_a_cut_has_no_options_where_nothing_is_cut(chunked, tmp_path, capsys) ->
     assert "cutting: expected none for a scene in chunks" in said
 
 
-def test_a_surface_is_drawn_without_gaussians(chunked, tmp_path, capsys) -> None:
-    words = ("render", chunked, "-o", tmp_path / "a", "--surface", "b.ply", "--memory", "1GB")
-    assert "memory: expected none with a surface" in failed(capsys, *words)
+@pytest.mark.parametrize("words", [("--memory", "1GB"), ("--level", "1")])
+def test_a_surface_is_drawn_without_gaussians(chunked, tmp_path, capsys, words) -> None:
+    given = ("render", chunked, "-o", tmp_path / "a", "--surface", "b.ply", *words)
+    assert "--memory, --level: expected neither with a surface" in failed(capsys, *given)
+
+
+def test_a_coarser_level_is_drawn(scene, chunked, tmp_path, capsys) -> None:
+    made = tmp_path / "levels"
+    assert main(["chunks", str(scene), "-o", str(made), "--levels", "2"]) == 0
+    pictures: dict[str, bytes] = {}
+    for level in ("0", "1", "2"):
+        words = ["render", str(made), "-o", str(tmp_path / level), "--level", level]
+        assert main([*words, "--what", "rgb,depth"]) == 0
+        pictures[level] = (tmp_path / level / "rgb" / "test_2.png").read_bytes()
+    assert len(set(pictures.values())) == 3
+    render = ("render", made, "-o", tmp_path / "other", "--level")
+    said = failed(capsys, *render, "3")
+    assert "level: expected one that" in said
+    assert "`splatseg chunks --levels` makes them" in said
+    said = failed(capsys, *render, "1", "--what", "rgb,classes")
+    assert "level: goes with rgb, depth, alpha, got classes" in said
+    said = failed(capsys, "render", scene, "-o", tmp_path / "other", "--level", "1")
+    assert "level: goes with a scene in chunks" in said
+    assert not (tmp_path / "other").exists()
 
 
 def test_what_is_said(scene, chunked, tmp_path, capsys) -> None:

@@ -9,9 +9,10 @@ import pytest
 import torch
 
 from splatseg.core import Gaussians
+from splatseg.core.coarser import coarser
 from splatseg.errors import FileFormatError, InputError, MissingFileError, RangeError
 from splatseg.io import chunks as files
-from splatseg.io.chunks import ChunkWriter, morton_order, open_chunks, write_chunks
+from splatseg.io.chunks import ChunkWriter, level_folder, morton_order, open_chunks, write_chunks
 from support.chunked import in_chunks, in_memory
 
 COLUMNS = ("means", "rotations", "scales", "opacities", "sh")
@@ -135,6 +136,25 @@ def test_harmonics_of_half_precision(gaussians, tmp_path, monkeypatch) -> None:
         ChunkWriter(tmp_path / "bright", 300, like=bright, half=True) as writer,
     ):
         writer.append(bright)
+
+
+def test_coarser_levels_keep_the_largest(rng, tmp_path, monkeypatch) -> None:
+    gaussians = some(rng, 640)
+    monkeypatch.setattr(files, "CHUNK_ROWS", 100)
+    write_chunks(lambda a, b: gaussians[a:b], 640, tmp_path, memory=10**9, levels=2, half=True)
+    levels = [open_chunks(level_folder(tmp_path, level), memory=1) for level in range(3)]
+    # 10 of 640 stand apart; 630 are seven chunks, 25 and then 7 of each hundred, 8 and 2 of 30.
+    assert [len(level) for level in levels] == [640, 10 + 6 * 25 + 8, 10 + 6 * 7 + 2]
+    for level in levels:
+        assert torch.equal(in_memory(level).means[:10], in_memory(levels[0]).means[:10])
+        assert (level.antialiased, level.low_pass) == (True, 0.1)
+        assert level.sh.dtype == torch.float16
+        assert level.chunks is not None
+        level.chunks.read([(0, len(level))]).check_values()
+    first = levels[0].chunks.read([(10, 14)])
+    wanted = coarser(first)
+    for name in ("means", "rotations", "scales", "opacities"):
+        assert torch.equal(getattr(in_memory(levels[1])[10:11], name), getattr(wanted, name))
 
 
 def test_the_source_must_be_renderable_and_not_empty(gaussians, tmp_path) -> None:

@@ -165,13 +165,17 @@ class OnScene(Printing):
         """The scene."""
         return load_scene(self.scene, data=self.data)
 
-    def open_streamed(self, memory: str | None) -> Scene:
+    def open_streamed(self, memory: str | None, *, level: int = 0) -> Scene:
         """The scene, for a command that streams one in chunks.
 
+        Args:
+            memory: What ``--memory`` says.
+            level: A coarser level of one in chunks.
+
         Raises:
-            InputError: If memory is given for a scene that is not in chunks.
+            InputError: If memory or a level is given for a scene that is not in chunks.
         """
-        scene = load_scene(self.scene, data=self.data, memory=memory_to_use(memory))
+        scene = load_scene(self.scene, data=self.data, memory=memory_to_use(memory), level=level)
         if memory is not None and scene.gaussians.chunks is None:
             raise InputError(
                 f"{MEMORY}: goes with a scene in chunks, and {self.scene} is read as a whole; "

@@ -5,6 +5,7 @@
       means.npy        (n, 3), rotations.npy (n, 4), scales.npy (n, 3), opacities.npy (n): float32
       sh.npy           (n, k, 3): harmonics of k coefficients a channel, float32 or float16
       extra_0.npy ...  further columns, whose names are in chunks.json
+      level_1/ ...     the same of fewer Gaussians, for previews, where they were asked for
 
 A chunk is a run of rows, and rows are ordered along a Morton curve, so that those of a chunk lie
 near each other: the largest Gaussians first, which are seen from far, then the others. One row is
@@ -30,7 +31,9 @@ from torch import Tensor
 from splatseg.core import Gaussians
 from splatseg.core.boundary import boundary
 from splatseg.core.chunks import Chunks
+from splatseg.core.coarser import RUN, coarser
 from splatseg.core.gaussians import LOW_PASS
+from splatseg.core.options import Natural
 from splatseg.errors import InputError, MissingFileError
 from splatseg.io.arrays import ArrayHeader, read_header, read_npy
 from splatseg.io.atomic import path_inside
@@ -85,6 +88,12 @@ class _Index:
     extra: list[str]
     antialiased: bool = False
     low_pass: Annotated[float, Meta(ge=0)] = LOW_PASS
+
+
+@boundary
+def level_folder(folder: Path, level: Natural) -> Path:
+    """The folder of a coarser level of Gaussians in chunks; 0 is all of them."""
+    return folder / f"level_{level}" if level else folder
 
 
 @boundary
@@ -390,6 +399,7 @@ def write_chunks(
     *,
     memory: int,
     half: bool = False,
+    levels: Natural = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> Int64[Tensor, "n"]:
     """Order Gaussians of any source along a Morton curve and write them as chunks.
@@ -404,6 +414,8 @@ def write_chunks(
         folder: An empty folder.
         memory: Bytes of the largest stretch.
         half: Harmonics as float16.
+        levels: How many coarser levels to write as well, each of a fourth of the Gaussians of the
+            one before but for those that stand apart as the largest, which all have.
         progress: Called with rows that were read and all there are to read.
 
     Returns:
@@ -451,7 +463,25 @@ def write_chunks(
                 own = {name: c[begin - first : stop - first] for name, c in room.items()}
                 named = {n.removeprefix("extra "): own.pop(n) for n in list(own) if "extra " in n}
                 writer.append(like.replace(**own, extra=named))
+    for level in range(1, levels + 1):
+        _write_coarser(folder, level, apart=apart, half=half)
     return order
+
+
+def _write_coarser(folder: Path, level: int, *, apart: int, half: bool) -> None:
+    """A level of the one before it, chunk by chunk."""
+    before = open_chunks(level_folder(folder, level - 1), memory=1)
+    chunks = before.chunks
+    if chunks is None:
+        raise InputError(f"{folder}: expected Gaussians in chunks, got others.")
+    runs = list(pairwise(chunks.starts.tolist()))
+    counts = [end - first if first < apart else -(-(end - first) // RUN) for first, end in runs]
+    into = level_folder(folder, level)
+    into.mkdir()
+    with ChunkWriter(into, sum(counts), like=before[:1].replace(extra={}), half=half) as writer:
+        for first, end in runs:
+            part = chunks.read([(first, end)])
+            writer.append(part if first < apart else coarser(part))
 
 
 def _unheard(done: int, total: int) -> None:

@@ -34,6 +34,7 @@ from splatseg.core import Gaussians, Layer, Scene, View
 from splatseg.core.boundary import boundary
 from splatseg.core.gaussians import no_gaussians
 from splatseg.core.json_values import MAX_NUMBER
+from splatseg.core.options import Natural
 from splatseg.errors import InputError, MissingFileError
 from splatseg.io.atomic import (
     atomic_folder,
@@ -44,7 +45,13 @@ from splatseg.io.atomic import (
     sync_tree,
 )
 from splatseg.io.cameras import cameras_content, relative_path, source_paths, views_from_content
-from splatseg.io.chunks import CHUNKS_FOLDER, INDEX_FILE, is_in_chunks, open_chunks
+from splatseg.io.chunks import (
+    CHUNKS_FOLDER,
+    INDEX_FILE,
+    is_in_chunks,
+    level_folder,
+    open_chunks,
+)
 from splatseg.io.foreign import derived_from, expect, is_file, is_folder
 from splatseg.io.json_files import check_version, read_json, write_json
 from splatseg.io.layers import load_layer, save_layer
@@ -164,8 +171,8 @@ def _no_layers(_: Path) -> Iterable[tuple[str, Layer]]:
 @boundary
 def save_scene_in_chunks(
     scene: Scene,
-    root: Path | str,
     gaussians: GaussiansToWrite,
+    root: Path | str,
     *,
     layers: Callable[[Path], Iterable[tuple[str, Layer]]] = _no_layers,
     evidence: Sequence[Path] = (),
@@ -174,8 +181,8 @@ def save_scene_in_chunks(
 
     Args:
         scene: The scene; its own Gaussians are not looked at.
-        root: The folder.
         gaussians: The Gaussians.
+        root: The folder.
         layers: Gives layers of these Gaussians and their names, one after the other, of the folder
             of the Gaussians that were written.
         evidence: Folders of evidence, copied under their own names.
@@ -192,6 +199,9 @@ def save_scene_in_chunks(
         folder = temporary / CHUNKS_FOLDER
         folder.mkdir()
         gaussians.write(folder)
+        written = len(open_chunks(folder, memory=1))
+        what = f"{gaussians.count} Gaussians to be written, got {written}"
+        expect(written == gaussians.count, "gaussians", what, error=InputError)
         _write(scene, temporary, {}, final=root, count=gaussians.count)
         for name, layer in layers(folder):
             _check_layer(name, layer, gaussians.count)
@@ -202,7 +212,11 @@ def save_scene_in_chunks(
 
 @boundary
 def load_scene(
-    root: Path | str, *, data: Path | str | None = None, memory: int | None = None
+    root: Path | str,
+    *,
+    data: Path | str | None = None,
+    memory: int | None = None,
+    level: Natural = 0,
 ) -> Scene:
     """Read a scene folder. Inverse of `save_scene`.
 
@@ -213,15 +227,18 @@ def load_scene(
             all the same; reading a photograph then fails.
         memory: Bytes that the Gaussians of a view may take, of a scene in chunks, which stay on
             the disk; others are read as a whole all the same. None refuses a scene in chunks.
+        level: Of a scene in chunks a coarser level, which its layers are not of; 0 is all of it.
 
     Raises:
-        InputError: If it is in chunks, and the caller cannot stream.
+        InputError: If it is in chunks, and the caller cannot stream; or it has no such level.
         MissingFileError: If there is no scene, or `data` lacks photographs of it.
         FileFormatError: If a file of it is broken, or of a later version.
     """
     root = Path(root)
     scene, count = load_scene_views(root, data=data)
-    gaussians = _gaussians(root, memory)
+    gaussians = _gaussians(root, memory, level)
+    if level:
+        return replace(scene, gaussians=gaussians)
     what = f"{count} Gaussians as {SCENE_FILE} says, got {len(gaussians)}"
     name = GAUSSIANS_FILE if gaussians.chunks is None else CHUNKS_FOLDER
     expect(len(gaussians) == count, root / name, what)
@@ -268,9 +285,11 @@ def load_scene_views(root: Path | str, *, data: Path | str | None = None) -> tup
     return scene, content.gaussians
 
 
-def _gaussians(root: Path, memory: int | None) -> Gaussians:
+def _gaussians(root: Path, memory: int | None, level: int) -> Gaussians:
     folder, file = root / CHUNKS_FOLDER, current_file(root, GAUSSIANS_FILE)
     if not folder.is_dir():
+        if level:
+            raise InputError(f"level: goes with a scene in chunks, got {level} of {root}.")
         return read_scene_splats(file)
     expect(not file.is_file(), root, f"{GAUSSIANS_FILE} or {CHUNKS_FOLDER}/{INDEX_FILE}, got both")
     if memory is None:
@@ -278,7 +297,12 @@ def _gaussians(root: Path, memory: int | None) -> Gaussians:
             f"{root}: its Gaussians are in chunks, which this cannot stream; "
             "`splatseg chunks SCENE -o NEW --whole` makes a scene that is read as a whole."
         )
-    return open_chunks(folder, memory=memory)
+    if level and not is_in_chunks(level_folder(folder, level)):
+        raise InputError(
+            f"level: expected one that {root} has, got {level}; `splatseg chunks --levels` makes "
+            "them."
+        )
+    return open_chunks(level_folder(folder, level), memory=memory)
 
 
 @boundary

@@ -10,10 +10,12 @@ import torch
 from splatseg.core import Edited, Layer, Scene, apply_rows
 from splatseg.core.boundary import boundary
 from splatseg.core.gaussians import no_gaussians
+from splatseg.core.options import Natural
 from splatseg.core.options import options as options_class
 from splatseg.errors import InputError
 from splatseg.io.captures import read_capture
 from splatseg.io.chunks import CHUNKS_FOLDER, is_in_chunks, open_chunks, write_chunks
+from splatseg.io.limits import memory_to_use
 from splatseg.io.scene import (
     GaussiansToWrite,
     load_scene,
@@ -42,6 +44,10 @@ class ChunkOptions:
     """Numbers of spherical harmonics. float32: renders keep their bits. float16: two thirds of the
     size at degree 2, and colours that differ by less than a level of 8 bit."""
 
+    levels: Natural = 0
+    """Coarser levels to write as well, for previews (`render --level`): each has a fourth of the
+    Gaussians of the one before, and the largest 1/64 of all."""
+
     whole: bool = False
     """The other way: SCENE is in chunks, and NEW has its Gaussians in one PLY file, in the order of
     the chunks."""
@@ -67,7 +73,7 @@ def chunk_scene(
     *,
     options: ChunkOptions | None = None,
     data: Path | None = None,
-    memory: int,
+    memory: int | None = None,
     observer: Observer = SILENT,
 ) -> ChunkedScene:
     """Write a scene in chunks of a scene or a PLY file, or the other way, without holding it.
@@ -80,7 +86,8 @@ def chunk_scene(
         options: How, and which way.
         data: The capture: of a PLY file, whose views the scene has (without moving the Gaussians);
             of a scene where it was moved.
-        memory: Bytes that may be held, besides 24 a Gaussian and one layer.
+        memory: Bytes that may be held, besides 24 a Gaussian and one layer; None is half of what
+            the machine has.
         observer: Is told of the progress.
 
     Raises:
@@ -88,6 +95,7 @@ def chunk_scene(
         FileFormatError: If it is damaged.
     """
     options = options or ChunkOptions()
+    memory = memory_to_use(None) if memory is None else memory
     check_new_folder(folder)
     chunked = is_in_chunks(source / CHUNKS_FOLDER)
     if options.whole:
@@ -115,6 +123,7 @@ def chunk_scene(
                 into,
                 memory=memory // 2,
                 half=options.harmonics == "float16",
+                levels=options.levels,
                 progress=step,
             )
 
@@ -125,8 +134,8 @@ def chunk_scene(
 
         save_scene_in_chunks(
             scene,
-            folder,
             GaussiansToWrite(count=count, write=write),
+            folder,
             layers=layers,
             evidence=_own_evidence(source),
         )

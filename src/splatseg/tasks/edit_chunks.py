@@ -101,8 +101,8 @@ def edit_chunks(
 
         save_scene_in_chunks(
             with_base(work.root, folder, scene, after),
-            folder,
             GaussiansToWrite(count=len(rows), write=write),
+            folder,
             layers=layers,
         )
     saved = load_scene(folder, memory=chunks.memory)

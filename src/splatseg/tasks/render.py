@@ -131,7 +131,9 @@ def _read(file: Path) -> np.ndarray:
         return np.array(image).astype(np.float64)
 
 
-_PICTURES = ("rgb", "depth", "alpha")
+PICTURES = ("rgb", "depth", "alpha")
+"""What is drawn of Gaussians without a layer."""
+
 _RECORD = "render.json"
 _CAMERAS = "transforms.json"
 _SOLID = 0.5
@@ -223,7 +225,7 @@ def render_views(
     if not options.what:
         raise InputError("what: expected rgb, depth, alpha or names of layers, got nothing.")
     wanted = list(dict.fromkeys(options.what))
-    names = [name for name in wanted if name not in _PICTURES]
+    names = [name for name in wanted if name not in PICTURES]
     _check_layers(names, {*(work.layer_names if field is None else field.layer_names)})
     if field is None:
         field = work.field(names)
@@ -331,7 +333,7 @@ def _check_layers(names: Sequence[str], known: set[str]) -> None:
     for name in names:
         if name.partition("@")[0] not in known:
             raise InputError(
-                f"what: expected {', '.join(_PICTURES)} or a layer of the scene "
+                f"what: expected {', '.join(PICTURES)} or a layer of the scene "
                 f"({', '.join(sorted(known)) or 'it has none'}), got {name!r}."
             )
 
@@ -378,7 +380,7 @@ def _check_output(output: Path, folders: Sequence[str], files: Sequence[str]) ->
 
 
 def _draw_pictures(looked_at: RenderableView, view: View, into: Mapping[str, Path]) -> None:
-    if not any(name in into for name in _PICTURES):
+    if not any(name in into for name in PICTURES):
         return
     shown = looked_at.signals(colour="rgb" in into)
     if "rgb" in into:
