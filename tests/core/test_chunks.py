@@ -93,6 +93,26 @@ def test_what_lies_beside_the_view_is_not_read(place, scale, expected) -> None:
     assert found.tolist() == [expected]
 
 
+@pytest.mark.parametrize(
+    ("low", "high", "expected"),
+    [
+        ((-9, -9, -9), (9, 9, 9), True),  # around the camera
+        ((-0.1, -0.1, -5), (0.1, 0.1, 1), True),  # from behind it
+        ((3, -1, -5), (9, 1, 2), False),  # to its right
+        ((1, -1, -5), (9, 1, 2), True),  # from its right into the view
+        ((-9, -9, -9), (9, 9, -1), False),
+    ],
+)
+def test_a_box_is_seen_if_some_place_in_it_can_be(low, high, expected) -> None:
+    box = replace(
+        each_alone(_at(torch.zeros(1, 3))),
+        low=torch.tensor([low]).float(),
+        high=torch.tensor([high]).float(),
+        largest=torch.zeros(1),
+    )
+    assert box.seen(camera(), near=NEAR, low_pass=LOW_PASS).tolist() == [expected]
+
+
 def test_chunks_that_follow_each_other_are_one_run() -> None:
     chunks = Chunks(
         starts=torch.tensor([0, 3, 5, 9, 10]),

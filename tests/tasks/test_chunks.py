@@ -10,11 +10,15 @@ import pytest
 import torch
 
 from splatseg.core import Gaussians, InstanceTree, Labels, Scene, Selection
+from splatseg.core.executor import LocalExecutor
 from splatseg.edit import Document, load_document
 from splatseg.errors import FileFormatError, InputError
 from splatseg.io import chunks as files
+from splatseg.io.evidence import open_evidence
 from splatseg.io.scene import load_scene, save_scene, save_scene_layer
 from splatseg.io.splats import read_splats, write_splats
+from splatseg.methods import MethodInputs, find_method
+from splatseg.methods.associate import AssociateMethodOptions, AssociateOptions
 from splatseg.prompting.prompts import AxisBox, Ball, Lasso, ViewPrompt
 from splatseg.render import render
 from splatseg.tasks import (
@@ -29,6 +33,7 @@ from splatseg.tasks import (
     edit_scene,
     export_scene,
     render_views,
+    see,
     segment,
     select,
 )
@@ -224,6 +229,29 @@ def test_a_lift(chunked, held, method, evidence, complete) -> None:
     assert bool((ours.labels.ids >= 0).any())
 
 
+def test_the_cameras_of_a_method_are_those_that_it_looks_through(generated_room, whole) -> None:
+    """Pixels of another size show other Gaussians at the margin."""
+    scene = load_scene(whole)
+    view = scene.train_views[0]
+    masks, maps = (
+        MethodInputs(
+            gaussians=scene.gaussians, views=(view,), evidence=open_evidence(generated_room / name)
+        )
+        for name in ("masks_nested", "labels_semantic")
+    )
+    associate, uplift = find_method("associate"), find_method("uplift")
+    small = AssociateMethodOptions(association=AssociateOptions(longest_side=80))
+    assert associate.camera is not None
+    assert uplift.camera is not None
+    for camera, width in (
+        (associate.camera(masks, small, view), 80),
+        (associate.camera(masks, associate.options(), view), 320),
+        (uplift.camera(maps, uplift.options(), view), 320),
+    ):
+        assert (camera.width, camera.height) == (width, width * 3 // 4)
+        assert camera.fx == pytest.approx(view.camera.fx * width / 320)
+
+
 @pytest.mark.parametrize(
     ("method", "options", "said"),
     [
@@ -235,6 +263,22 @@ def test_a_lift(chunked, held, method, evidence, complete) -> None:
 def test_a_lift_that_cannot_stream(chunked, method, options, said) -> None:
     with pytest.raises(InputError, match=said):
         segment(chunked, method, options=SegmentOptions(**options), backend="cpu")
+
+
+def test_views_of_chunks_are_worked_on_in_this_process(chunked, tmp_path) -> None:
+    """Other processes would be sent all of them."""
+    other = LocalExecutor()
+    with pytest.raises(InputError, match="executor: needs all Gaussians at once"):
+        render_views(chunked, tmp_path / "made", executor=other)
+    with pytest.raises(InputError, match="executor: needs all Gaussians at once"):
+        see(chunked, "classical", "new", executor=other)
+    with pytest.raises(InputError, match="executor: needs all Gaussians at once"):
+        segment(
+            chunked,
+            "uplift",
+            options=SegmentOptions(evidence="labels_semantic"),
+            executor=other,
+        )
 
 
 def test_a_lift_with_too_little_memory(chunked) -> None:

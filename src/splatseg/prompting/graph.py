@@ -101,7 +101,7 @@ hang together with the band."""
 _MARGIN = 0.25
 """Of what a chunk is usually wide, by which neighbours are looked for around a selection."""
 
-_GRAPH_BYTES = 700
+_GRAPH_BYTES = 1060
 """Of each Gaussian while its neighbours are found."""
 
 _MAX_BAND = 20_000

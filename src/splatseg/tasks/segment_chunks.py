@@ -17,7 +17,7 @@ from splatseg.methods import Method, MethodInputs, Refined
 from splatseg.render import prepare
 from splatseg.tasks.work import Work, check_streams
 
-_COMPLETION_BYTES = 280
+_COMPLETION_BYTES = 450
 """Of each Gaussian while labels spread to neighbours."""
 
 
