@@ -238,7 +238,7 @@ def test_bad_input_is_refused(rng, views) -> None:
         {"min_weight": -1.0},
         {"min_weight": float("nan")},
         {"min_share": 1.1},
-        {"memory": 0},
+        {"table_memory": 0},
     ):
         with pytest.raises(RangeError, match=next(iter(wrong))):
             UpliftOptions(**wrong)
