@@ -8,7 +8,7 @@ import torch
 from render_scenes import float32, random_camera, random_gaussians
 
 from splatseg import render as splat
-from splatseg.errors import InputError, RangeError
+from splatseg.errors import FileFormatError, InputError
 from splatseg.render import SparseImage, SparseSignal
 from support.chunked import in_chunks, in_memory
 
@@ -135,7 +135,7 @@ def test_a_row_that_cannot_be_rendered_is_refused_when_it_is_read(chunked, tmp_p
     data = bytearray(path.read_bytes())
     data[-4 * COUNT :] = np.full(COUNT, 7, np.float32).tobytes()
     path.write_bytes(data)
-    with pytest.raises(RangeError, match="opacities"):
+    with pytest.raises(FileFormatError, match=r"gaussians: opacities: expected values"):
         splat.render(chunked, random_camera(rng, width=WIDTH, height=HEIGHT))
 
 

@@ -208,10 +208,17 @@ def test_pictures_depths_and_label_maps_of_views(chunked, held, tmp_path) -> Non
         assert path.read_bytes() == other.read_bytes(), path
 
 
-def test_a_view_that_the_memory_is_too_small_for(chunked, tmp_path) -> None:
-    small = load_scene(chunked.root, memory=10_000)
-    with pytest.raises(InputError, match=r"^memory: a view has \d+ Gaussians before it"):
-        render_views(small, tmp_path / "made", backend="cpu")
+def test_a_view_that_the_memory_is_too_small_for(chunked, tmp_path, monkeypatch) -> None:
+    """It is said before anything is drawn, also of the last."""
+    needs = []
+    for view in chunked.views:
+        seen = chunked.gaussians.chunks.seen(view.camera, near=0.01, low_pass=0.1)
+        needs.append(len(chunked.gaussians.chunks.rows(seen)))
+    bytes_of_one = 4 * (11 + 3 * chunked.gaussians.sh.shape[1]) + 170
+    small = load_scene(chunked.root, memory=bytes_of_one * max(needs) - 1)
+    monkeypatch.setattr("splatseg.tasks.render._draw_view", None)
+    with pytest.raises(InputError, match=rf"^memory: a view has {max(needs)} Gaussians before it"):
+        render_views(small, tmp_path / "made", backend="cpu", options=RenderingOptions(split="all"))
     assert not (tmp_path / "made").exists()
 
 

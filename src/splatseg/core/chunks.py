@@ -48,7 +48,11 @@ class ReadRows(Protocol):
     """Reads runs of rows, from one to before another, one behind the other."""
 
     def __call__(self, runs: Sequence[tuple[int, int]], *, colours: bool = True) -> "Gaussians":
-        """Float32, without extra columns; without `colours` all harmonics are 0, of degree 0."""
+        """Float32, without extra columns; without `colours` all harmonics are 0, of degree 0.
+
+        Raises:
+            FileFormatError: If files are damaged, or hold what cannot be rendered.
+        """
         ...
 
 
@@ -148,7 +152,7 @@ class Chunks:
         if needed > self.memory:
             raise InputError(
                 f"memory: a view has {count} Gaussians before it, which take about "
-                f"{needed / 1e9:.1f} GB, more than the {self.memory / 1e9:.1f} GB that were "
+                f"{needed / 1e9:.2f} GB, more than the {self.memory / 1e9:.2f} GB that were "
                 "allowed; allow more."
             )
         return runs

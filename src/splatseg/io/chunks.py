@@ -37,7 +37,7 @@ from splatseg.core.options import Natural
 from splatseg.errors import InputError, MissingFileError
 from splatseg.io.arrays import ArrayHeader, read_header, read_npy
 from splatseg.io.atomic import path_inside
-from splatseg.io.foreign import expect, reading
+from splatseg.io.foreign import derived_from, expect, reading
 from splatseg.io.json_files import check_version, read_json, write_json
 from splatseg.io.schema import Whole, structured
 
@@ -185,7 +185,7 @@ class _Files:
         """Rows of some runs, one run behind the other; see `core.chunks.ReadRows`."""
         means = self._rows("means", runs)
         self._check(means, runs)
-        return Gaussians(
+        found = Gaussians(
             means=torch.from_numpy(means),
             rotations=torch.from_numpy(self._rows("rotations", runs)),
             scales=torch.from_numpy(self._rows("scales", runs)),
@@ -196,6 +196,9 @@ class _Files:
             antialiased=self._about.antialiased,
             low_pass=self._about.low_pass,
         )
+        with derived_from(self._folder):
+            found.check_values()
+        return found
 
     def _rows(self, name: str, runs: Sequence[tuple[int, int]]) -> NDArray[np.float32]:
         with self._opened(name) as (file, header):

@@ -96,8 +96,7 @@ def prepare(
     )
 
     def read(colours: bool) -> PreparedView:
-        near = chunks.read(runs, colours=colours)
-        check_scene(near)
+        near = chunks.read(runs, colours=colours)  # with sound values
         return PreparedView(near, camera, options=options, backend=chosen)
 
     part = ViewPart(rows_of(runs), read)

@@ -45,7 +45,7 @@ from splatseg.io.images import check_encoder, save_png, write_video
 from splatseg.io.json_files import read_json, write_json
 from splatseg.io.surfaces import read_surface
 from splatseg.lift import GaussianField
-from splatseg.render import BackendName
+from splatseg.render import BackendName, prepare
 from splatseg.report.colours import colour_labels, layer_colours, legend_of
 from splatseg.report.images import colour_depth
 from splatseg.tasks.work import (
@@ -238,6 +238,9 @@ def render_views(
     films = [name for name in wanted if options.video]
     files = [f"{name}.mp4" for name in films] + ([_CAMERAS] if on_path else [])
     record = _check_output(output, folders, files)
+    if scene.gaussians.chunks is not None:
+        for view in views:  # nothing is read: what does not fit is said before the work
+            prepare(scene.gaussians, view.camera, backend=backend).close()
     output.mkdir(parents=True, exist_ok=True)
     try:
         _render(
