@@ -113,7 +113,7 @@ def features(made: Made) -> str:
 
 def labels(made: Made) -> str:
     """More ids than any table holds."""
-    options = UpliftOptions(memory=1 << 28, candidates=4)
+    options = UpliftOptions(table_memory=1 << 28, candidates=4)
     found = uplift(room(made.count, 0), made.views, made, options=options)
     seen = int((found.ids >= 0).sum())
     return f"{made.ids * len(made.views)} ids onto {made.count} Gaussians, {seen} labelled"

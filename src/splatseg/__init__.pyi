@@ -61,6 +61,7 @@ from .render import weights as weights
 from .synthetic import write_capture as write_capture
 from .tasks import AttachLayersOptions as AttachLayersOptions
 from .tasks import CheckpointOptions as CheckpointOptions
+from .tasks import ChunkOptions as ChunkOptions
 from .tasks import DemoOptions as DemoOptions
 from .tasks import EditOptions as EditOptions
 from .tasks import EvaluationOptions as EvaluationOptions
@@ -76,7 +77,9 @@ from .tasks import SelectOptions as SelectOptions
 from .tasks import SharpenSceneOptions as SharpenSceneOptions
 from .tasks import StreetOptions as StreetOptions
 from .tasks import attach_layers as attach_layers
+from .tasks import chunk_scene as chunk_scene
 from .tasks import describe as describe
+from .tasks import edit_chunks as edit_chunks
 from .tasks import edit_scene as edit_scene
 from .tasks import evaluate_scene as evaluate_scene
 from .tasks import examine_capture as examine_capture

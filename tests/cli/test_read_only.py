@@ -17,6 +17,7 @@ from splatseg.io.splats import write_splats
 LINES = {
     "fit": "fit CAPTURE -o HERE/made --steps 10",
     "import": "import PLY -o HERE/made --max-views 2",
+    "chunks": "chunks SCENE -o HERE/made",
     "doctor": "doctor CAPTURE --fix HERE/made",
     "see": "see SCENE --model classical --evidence new",
     "segment": "segment SCENE --method uplift --evidence labels_semantic --layer classes",

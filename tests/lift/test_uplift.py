@@ -70,7 +70,7 @@ def test_candidates_are_exact_whatever_the_memory(rng, views, memory, monkeypatc
         gaussians,
         views,
         maps,
-        options=UpliftOptions(candidates=3, memory=memory),
+        options=UpliftOptions(candidates=3, table_memory=memory),
         backend=BACKEND,
         progress=lambda done, total: calls.append((done, total)),
     )
@@ -135,7 +135,7 @@ def test_equal_votes_go_to_the_smaller_id() -> None:
         )
         for memory in (1, 1 << 20):
             labels = uplift(
-                gaussians, views, maps, options=UpliftOptions(memory=memory), backend=BACKEND
+                gaussians, views, maps, options=UpliftOptions(table_memory=memory), backend=BACKEND
             )
             assert labels.confidence.tolist() == pytest.approx([0.5], abs=1e-6)
             assert labels.ids.tolist() == [2]
@@ -238,7 +238,7 @@ def test_bad_input_is_refused(rng, views) -> None:
         {"min_weight": -1.0},
         {"min_weight": float("nan")},
         {"min_share": 1.1},
-        {"memory": 0},
+        {"table_memory": 0},
     ):
         with pytest.raises(RangeError, match=next(iter(wrong))):
             UpliftOptions(**wrong)

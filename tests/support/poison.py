@@ -113,7 +113,12 @@ class World:
             save_masks,
         )
         from splatseg.io.images import save_png
-        from splatseg.io.scene import save_scene, save_scene_layer
+        from splatseg.io.scene import (
+            GaussiansToWrite,
+            save_scene,
+            save_scene_in_chunks,
+            save_scene_layer,
+        )
 
         self.folder = folder
         self.made = 0
@@ -142,6 +147,9 @@ class World:
             left = Maps().label_map(name).ids == 1
             save_masks(core.MaskSet.from_dense(left[None]), masks, name)
         self.masks = open_evidence(masks)
+        chunked = core.Scene(gaussians=self.gaussians, views=self.views)
+        made = GaussiansToWrite(count=COUNT, write=self.write_chunks)
+        save_scene_in_chunks(chunked, made, folder / "chunked")
         self.benchmark = self._benchmark()
         self.room = synthetic.room(seed=0)
         self.truth = synthetic.render_truth(self.room, CAMERA)
@@ -158,6 +166,12 @@ class World:
             (scene / "images" / f"{view.name}.png").write_bytes(view.image.read_bytes())
         save_mask(np.ones((HEIGHT, WIDTH), bool), scene / "masks/a.png")
         return scene
+
+    def write_chunks(self, folder: Path) -> None:
+        """The Gaussians in chunks."""
+        from splatseg.io.chunks import write_chunks
+
+        write_chunks(lambda first, end: self.gaussians[first:end], COUNT, folder, memory=1)
 
     def path(self) -> Path:
         """A path of nothing yet."""
@@ -457,6 +471,7 @@ def inner(world: World, by_type: dict[type, Any]) -> dict[str, Any]:
     from splatseg.evaluate import BoundaryCounts, Detections
     from splatseg.fit import FitOptions, cut_capture
     from splatseg.io.export import objects_of
+    from splatseg.io.scene import GaussiansToWrite, load_scene
     from splatseg.lift import EvidenceSegments, UpliftOptions, uplift
     from splatseg.lift.training import AdamConstants, LabelTargets
     from splatseg.methods import find_method
@@ -555,6 +570,15 @@ def inner(world: World, by_type: dict[type, Any]) -> dict[str, Any]:
         "tasks.describe.path": world.folder / "scene",
         "tasks.edit_scene.options": EditOptions(remove=True, layer="things", ids=(1,)),
         "tasks.edit_scene.folder": world.path(),
+        "tasks.edit_chunks.scene": load_scene(world.folder / "chunked", memory=10**9),
+        "tasks.edit_chunks.options": EditOptions(remove=True, sphere=(0, 0, 2, 0.5)),
+        "tasks.edit_chunks.folder": world.path(),
+        "tasks.chunk_scene.source": world.folder / "scene",
+        "tasks.chunk_scene.folder": world.path(),
+        "io.scene.save_scene_in_chunks.root": world.path(),
+        "io.scene.save_scene_in_chunks.gaussians": GaussiansToWrite(
+            count=COUNT, write=world.write_chunks
+        ),
         "tasks.export_scene.output": world.folder / "exported.ply",
         "tasks.export_layer.layer": world.labels,
         "tasks.report_layer.result": made,

@@ -72,6 +72,10 @@ COMMANDS: dict[str, CommandEntry] = {
         "any splat file, with or without photographs -> a scene",
         part="import",
     ),
+    "chunks": CommandEntry(
+        "splatseg.cli.chunks",
+        "a scene or PLY file larger than memory -> a scene that is streamed from the disk",
+    ),
     "doctor": CommandEntry(
         "splatseg.cli.info",
         "faults in a capture's cameras and points, and a corrected copy",

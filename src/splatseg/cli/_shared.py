@@ -24,7 +24,8 @@ from typing_extensions import override
 
 from splatseg.cli._streams import tell
 from splatseg.core import Executor, Scene
-from splatseg.errors import visible
+from splatseg.errors import InputError, visible
+from splatseg.io.limits import MEMORY, memory_to_use
 from splatseg.io.scene import load_scene
 from splatseg.io.splats import Values
 from splatseg.render import BackendName
@@ -110,6 +111,16 @@ Overwrite: TypeAlias = Annotated[
     bool, _flag(None, "Replace what an earlier run wrote under the same name.")
 ]
 
+Memory: TypeAlias = Annotated[
+    str | None,
+    _flag(
+        "SIZE",
+        "Memory that Gaussians of a scene in chunks may take, such as 8GB: those of one view with "
+        "what rendering makes of them, or of one stretch that is written. Layers, 4 to 80 bytes a "
+        "Gaussian, come on top. Default: half of the machine's.",
+    ),
+]
+
 Frames: TypeAlias = Annotated[int, _flag("N", "Number of views of a path.")]
 
 Json: TypeAlias = Annotated[
@@ -153,6 +164,24 @@ class OnScene(Printing):
     def open(self) -> Scene:
         """The scene."""
         return load_scene(self.scene, data=self.data)
+
+    def open_streamed(self, memory: str | None, *, level: int = 0) -> Scene:
+        """The scene, for a command that streams one in chunks.
+
+        Args:
+            memory: What ``--memory`` says.
+            level: A coarser level of one in chunks.
+
+        Raises:
+            InputError: If memory or a level is given for a scene that is not in chunks.
+        """
+        scene = load_scene(self.scene, data=self.data, memory=memory_to_use(memory), level=level)
+        if memory is not None and scene.gaussians.chunks is None:
+            raise InputError(
+                f"{MEMORY}: goes with a scene in chunks, and {self.scene} is read as a whole; "
+                "`splatseg chunks SCENE -o NEW` makes one."
+            )
+        return scene
 
 
 @dataclass(frozen=True, kw_only=True)

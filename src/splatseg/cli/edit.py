@@ -6,13 +6,16 @@ from typing import Annotated
 
 import tyro
 
-from splatseg.cli._shared import NewScene, OnScene, print_result
+from splatseg.cli._shared import Memory, NewScene, OnScene, print_result
 from splatseg.edit import load_document
+from splatseg.errors import InputError
+from splatseg.io.chunks import CHUNKS_FOLDER, is_in_chunks
 from splatseg.lift import ConfusionOptions, CutOptions, SharpenOptions
 from splatseg.tasks import (
     EditOptions,
     SharpenedScene,
     SharpenSceneOptions,
+    edit_chunks,
     edit_scene,
     sharpen_scene,
 )
@@ -59,29 +62,42 @@ class Command(OnScene):
     cutting: CutOptions = field(default_factory=CutOptions)
     """How Gaussians are split."""
 
+    memory: Memory = None
+
 
 def run(command: Command) -> None:
     """Edit a scene."""
     started = time.monotonic()
-    made = edit_scene(
-        load_document(command.scene, data=command.data),
-        command.output,
-        options=command.options,
-        cut_options=command.cutting,
-        data=command.data,
-        backend=command.backend,
-        observer=command.observer,
-    )
-    count = len(made.document.scene.gaussians)
+    if is_in_chunks(command.scene / CHUNKS_FOLDER) or command.memory is not None:
+        if command.cutting != CutOptions():
+            raise InputError("cutting: expected none for a scene in chunks, which splits nothing.")
+        made = edit_chunks(
+            command.open_streamed(command.memory),
+            command.output,
+            options=command.options,
+            backend=command.backend,
+            observer=command.observer,
+        )
+    else:
+        made = edit_scene(
+            load_document(command.scene, data=command.data),
+            command.output,
+            options=command.options,
+            cut_options=command.cutting,
+            data=command.data,
+            backend=command.backend,
+            observer=command.observer,
+        )
+    count, names = len(made.document.scene.gaussians), list(made.document.scene.layers)
     facts = {
         "scene": made.folder,
         "gaussians": count,
-        "layers": list(made.document.layers),
+        "layers": names,
         "operations": [dict(operation) for operation in made.operations],
         "report": made.report,
         "seconds": round(time.monotonic() - started, 3),
     }
-    layers = ", ".join(made.document.layers) or "no layers"
+    layers = ", ".join(names) or "no layers"
     lines = [f"{made.folder}: {count} Gaussians; {layers}"]
     if made.report is not None:
         lines.append(f"pictures before and after: {made.report}")

@@ -8,6 +8,7 @@ from typing import Annotated
 import tyro
 
 from splatseg.cli._shared import (
+    Memory,
     OnScene,
     Printing,
     print_result,
@@ -58,12 +59,14 @@ class Command(OnScene):
     export: tyro.conf.OmitArgPrefixes[ExportOptions] = field(default_factory=ExportOptions)
     """Layers to export, and formats."""
 
+    memory: Memory = None
+
 
 def run(command: Command) -> None:
     """Export a scene."""
     started = time.monotonic()
     done = export_scene(
-        command.open(),
+        command.open_streamed(command.memory),
         command.output,
         command.what,
         options=command.export,

@@ -155,7 +155,10 @@ def _views(facts: dict[str, Any]) -> str:
 def _gaussians(facts: dict[str, Any]) -> str:
     extra = facts["extra_columns"]
     columns = f", further columns {', '.join(extra)}" if extra else ""
-    return f"{facts['gaussians']} Gaussians, harmonics of degree {facts['sh_degree']}{columns}"
+    chunks = f" in {facts['chunks']} chunks" if facts["chunks"] else ""
+    return (
+        f"{facts['gaussians']} Gaussians{chunks}, harmonics of degree {facts['sh_degree']}{columns}"
+    )
 
 
 def _world(facts: dict[str, Any]) -> list[str]:

@@ -7,12 +7,13 @@ from typing import Annotated
 
 import tyro
 
-from splatseg.cli._shared import Field, OnViews, print_result
+from splatseg.cli._shared import Field, Memory, OnViews, print_result
 from splatseg.errors import InputError
 from splatseg.evaluate import PointSurfaceOptions
 from splatseg.io.captures import read_capture
 from splatseg.io.scene_folder import is_scene
 from splatseg.tasks import ExecutorOptions, Rendering, RenderingOptions, render_truth, render_views
+from splatseg.tasks.render import PICTURES
 from splatseg.tasks.work import scene_field
 
 
@@ -54,6 +55,12 @@ class Command(OnViews):
 
     field: Field = None
 
+    memory: Memory = None
+
+    level: int = 0
+    """Coarser level of a scene in chunks, for previews: rgb, depth and alpha of fewer Gaussians,
+    those that `splatseg chunks --levels` made. 0 is all of them."""
+
     surface: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Labelled mesh or points in the world of the cameras, drawn instead of the scene: a PLY with
     ids of vertices or faces, whose columns are the names of its labels, or an .npz of points with
@@ -79,7 +86,8 @@ def run(command: Command) -> None:
     started = time.monotonic()
     if command.surface is None:
         _check_without_surface(command)
-        scene = command.open()
+        _check_level(command)
+        scene = command.open_streamed(command.memory, level=command.level)
         with command.open_executor() as executor:
             done = render_views(
                 scene,
@@ -102,6 +110,13 @@ def run(command: Command) -> None:
     print_result(facts, [line], json=command.json)
 
 
+def _check_level(command: Command) -> None:
+    layers = [name for name in command.rendering.what if name not in PICTURES]
+    if command.level and (layers or command.field is not None):
+        named = ", ".join(layers) or "a field"
+        raise InputError(f"level: goes with {', '.join(PICTURES)}, got {named}.")
+
+
 def _check_without_surface(command: Command) -> None:
     asked = (command.zero_is_class, command.void is not None, command.radius is not None)
     if any(asked) or command.fill != PointSurfaceOptions().fill:
@@ -113,6 +128,8 @@ def _truth(command: Command, path: Path) -> Rendering:
         raise InputError("field: expected none with a surface, which is drawn instead of it.")
     if command.executing != ExecutorOptions():
         raise InputError("executor: expected none with a surface, which is drawn in this process.")
+    if command.memory is not None or command.level:
+        raise InputError("memory, level: expected neither with a surface, drawn without Gaussians.")
     options = command.rendering
     if options.what == RenderingOptions().what:
         options = replace(options, what=())

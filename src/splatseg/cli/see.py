@@ -160,7 +160,7 @@ def run(command: Command) -> None:
     """See a scene."""
     with command.open_executor() as executor:
         seen = see(
-            command.open(),
+            command.open_streamed(None),
             command.model,
             command.evidence,
             options=command.seeing,

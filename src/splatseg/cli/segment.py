@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar
 
 import tyro
 
-from splatseg.cli._shared import OnViews, print_result, typed
+from splatseg.cli._shared import Memory, OnViews, print_result, typed
 from splatseg.cli._words import option_value
 from splatseg.core import UNLABELLED, Features, Selection, VoxelFeatures
 from splatseg.core.instance_tree import layer_kind
@@ -29,6 +29,7 @@ from splatseg.tasks import (
     save_segmentation,
     segment,
 )
+from splatseg.tasks.work import check_streams
 
 CONFIG = (tyro.conf.HelptextFromCommentsOff,)
 """Options of the method and the shared ones are flags without a prefix."""
@@ -117,6 +118,8 @@ def command_for(words: Sequence[str]) -> type[Any]:
         tyro.conf.arg(help=f"Options of method {name}: {method.summary} ({method.reference})."),
     ]
     own: list[tuple[str, Any, Any]] = [("options", options, field(default=default))]
+    if method.camera is not None:
+        own.append(("memory", Memory, field(default=None)))
     if method.published_differs:
         own.append(_shared_with(method.published_differs))
     made = make_dataclass(
@@ -159,7 +162,10 @@ def run(command: Command) -> None:
     """Segment a scene."""
     started = time.monotonic()
     observer = command.observer
-    scene = command.open()
+    # Of a method that streams; trainings have a memory of another kind among their options.
+    scene = command.open_streamed(getattr(command, "memory", None))
+    if command.report:
+        check_streams(scene, "--report")
     opened = time.monotonic() - started
     truth = None if command.truth is None else open_evidence(command.truth)
     method = find_method(command.method)

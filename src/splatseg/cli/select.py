@@ -12,7 +12,7 @@ import torch
 import tyro
 from torch import Tensor
 
-from splatseg.cli._shared import Device, Downloads, OnScene, named_model, print_result
+from splatseg.cli._shared import Device, Downloads, Memory, OnScene, named_model, print_result
 from splatseg.core import PromptableMasks, Scene, Selection, View
 from splatseg.core.instance_tree import layer_kind
 from splatseg.core.models import GroundedMasks, TextFeatures
@@ -45,7 +45,7 @@ from splatseg.tasks import (
     text_prompts,
 )
 from splatseg.tasks.see import prompter_of
-from splatseg.tasks.work import Work
+from splatseg.tasks.work import Work, check_streams
 
 _T = TypeVar("_T")
 
@@ -188,6 +188,8 @@ class Command(OnScene):
     """Also write DIR/VIEW.png for each view of a prompt, with the selection outlined and points
     marked."""
 
+    memory: Memory = None
+
     selecting: tyro.conf.OmitArgPrefixes[_Options] = field(default_factory=_Options)
     """Source of the selection, and its post-processing."""
 
@@ -196,7 +198,9 @@ def run(command: Command) -> None:
     """Select in a scene."""
     started = time.monotonic()
     observer = command.observer
-    scene = command.open()
+    scene = command.open_streamed(command.memory)
+    if command.text:
+        check_streams(scene, "--text")
     _check_text(command)
     prompts = _prompts(command, scene)
     base, mode = _base(command, scene)

@@ -20,11 +20,15 @@ from torch import Tensor
 
 from splatseg._check import check_finite, check_values
 from splatseg.core.boundary import boundary, convert_fields
+from splatseg.core.chunks import Chunks
 from splatseg.core.coerce import as_rows
 from splatseg.core.rigid import Similarity, quaternion_from_rotation, quaternion_multiply
 from splatseg.core.sh import SH_C0, degree_of, rotate_sh
 from splatseg.core.upward import Previewed
 from splatseg.errors import InputError, RangeError, ShapeError
+
+_COLOURS = 1 << 20
+"""Gaussians on the disk whose colours are read at once."""
 
 _BLOCK = 1 << 15
 """Values converted at once: the float64 copies stay in the processor's cache."""
@@ -118,6 +122,11 @@ class Gaussians(Previewed):
     """Variance of the filter that they are drawn with, square pixels
     (`RenderOptions.low_pass`). Other than 3DGS's, it goes with them into PLY files."""
 
+    chunks: Chunks | None = field(default=None, init=False, repr=False)
+    """Where they are on the disk: the arrays are maps of files then, and a view reads what it
+    needs. None for Gaussians in memory, and for all that is made of others: whoever changes a
+    column or takes rows has Gaussians of his own."""
+
     def __post_init__(self) -> None:
         convert_fields(self)
         n = len(self.means)
@@ -152,6 +161,10 @@ class Gaussians(Previewed):
     @property
     def colours(self) -> Float[Tensor, "n 3"]:
         """The mean colour over directions (degree 0), not clamped."""
+        if self.chunks is not None:
+            # Harmonics lie side by side: looked at in the map, all of them would stay.
+            parts = [self.chunks.read([run]).sh[:, 0] for run in self.chunks.blocks(_COLOURS)]
+            return 0.5 + SH_C0 * torch.cat([self.sh[:0, 0].float(), *parts])
         return 0.5 + SH_C0 * self.sh[:, 0]
 
     @property
@@ -167,6 +180,12 @@ class Gaussians(Previewed):
     def replace(self, **changes: Any) -> "Gaussians":
         """The same Gaussians with some columns exchanged."""
         return _replace(self, **changes)
+
+    def in_chunks(self, chunks: Chunks) -> "Gaussians":
+        """The same Gaussians, of which views read `chunks`; see `io.chunks.open_chunks`."""
+        made = self.replace()
+        object.__setattr__(made, "chunks", chunks)
+        return made
 
     @boundary
     def to(
@@ -197,8 +216,12 @@ class Gaussians(Previewed):
         """Raise `RangeError` unless every row can be rendered.
 
         Means, rotations, scales, opacities and SH are finite, scales are not negative,
-        opacities lie in [0, 1] and no quaternion is zero.
+        opacities lie in [0, 1] and no quaternion is zero. Of Gaussians on the disk only the means
+        are looked at, which are used as a whole; what a view reads is checked then.
         """
+        if self.chunks is not None:
+            check_finite("means", self.means)
+            return
         check_finite("means", self.means)
         check_finite("rotations", self.rotations)
         check_values("scales", self.scales, 0.0, float("inf"))
@@ -259,6 +282,18 @@ class Gaussians(Previewed):
         arrays = {name: torch.cat([getattr(part, name) for part in parts]) for name in _ARRAYS}
         extra = {name: torch.cat([part.extra[name] for part in parts]) for name in names}
         return parts[0].replace(**arrays, extra=extra)
+
+
+def no_gaussians() -> Gaussians:
+    """None of degree 0."""
+    nothing = torch.zeros(0, 3)
+    return Gaussians(
+        means=nothing,
+        rotations=torch.zeros(0, 4),
+        scales=nothing,
+        opacities=torch.zeros(0),
+        sh=torch.zeros(0, 1, 3),
+    )
 
 
 def _device(device: torch.device | str | None) -> torch.device | None:

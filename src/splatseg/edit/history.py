@@ -65,7 +65,7 @@ def apply(
         case "merge":
             after = _merged(now, load_document(operation.other or ""), operation.transform)
         case "transform" if chosen is None:
-            after = replace(now, scene=_moved_scene(scene, cast("Similarity", operation.transform)))
+            after = replace(now, scene=moved_scene(scene, cast("Similarity", operation.transform)))
         case "remove" if operation.fill is not None and chosen is not None:
             after, counts = _removed_and_filled(now, chosen, operation.fill, (backend, progress))
         case _:
@@ -144,7 +144,7 @@ def moved_view(view: View, new_from_old: Similarity) -> View:
     return replace(view, camera=view.camera.moved(new_from_old), depth_unit=unit)
 
 
-def _moved_scene(scene: Scene, new_from_old: Similarity) -> Scene:
+def moved_scene(scene: Scene, new_from_old: Similarity) -> Scene:
     """A scene in another frame: cameras, up and units move with the Gaussians."""
     up = scene.up
     if up is not None:

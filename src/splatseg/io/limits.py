@@ -8,6 +8,7 @@ What people have stays far below both; docs/formats.md has a table of what count
 The first number is raised for a whole program with `--max-unpacked`, or with `unpacking`.
 """
 
+import os
 import re
 from collections.abc import Generator
 from contextlib import contextmanager
@@ -21,6 +22,9 @@ RATIO = 64
 """Times its own size that any file may unpack to."""
 
 OPTION = "--max-unpacked"
+
+MEMORY = "--memory"
+"""The option of commands that stream a scene in chunks."""
 
 _UNITS = {"": 1, "k": 10**3, "M": 10**6, "G": 10**9, "Ki": 1 << 10, "Mi": 1 << 20, "Gi": 1 << 30}
 _SIZE = re.compile(r"(\d{1,12})\s?(k|M|G|Ki|Mi|Gi|)B?")
@@ -91,8 +95,26 @@ def unpacking(free: int | None) -> Generator[None]:
         _free, Image.MAX_IMAGE_PIXELS = before
 
 
-def parse_size(text: str) -> int:
+def memory_to_use(text: str | None) -> int:
+    """Bytes that ``--memory`` allows; without it half of what the machine has.
+
+    Raises:
+        InputError: If it is no size, or nothing.
+    """
+    if text is None:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
+    size = parse_size(text, option=MEMORY)
+    if not size:
+        raise InputError(f"{MEMORY}: expected more than nothing, got {quoted(text)}.")
+    return size
+
+
+def parse_size(text: str, *, option: str = OPTION) -> int:
     """Bytes from words such as ``500MB`` (10^6), ``2 GiB`` (2^30) or a plain number.
+
+    Args:
+        text: The words.
+        option: The option that they are of, for the message.
 
     Raises:
         InputError: If it is something else.
@@ -103,7 +125,7 @@ def parse_size(text: str) -> int:
     """
     found = _SIZE.fullmatch(text.strip())
     if found is None:
-        raise InputError(f"{OPTION}: expected a size such as 4GB or 500MiB, got {quoted(text)}.")
+        raise InputError(f"{option}: expected a size such as 4GB or 500MiB, got {quoted(text)}.")
     return int(found[1]) * _UNITS[found[2]]
 
 

@@ -2,7 +2,8 @@
 
     SCENE/
       scene.json                format version, source capture, split, up, metres, classes
-      gaussians.ply             the Gaussians
+      gaussians.ply             the Gaussians, or
+      gaussians/                the Gaussians in chunks, which commands stream, see `io.chunks`
       cameras/transforms.json   views, in nerfstudio's layout
       evidence/<name>/          what 2D models saw
       layers/<name>.npz         what is known of each Gaussian
@@ -21,7 +22,7 @@ absolute one, and opens without it.
 import os
 import re
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,9 +30,11 @@ from typing import Annotated, Any
 
 from msgspec import Meta
 
-from splatseg.core import Layer, Scene, View
+from splatseg.core import Gaussians, Layer, Scene, View
 from splatseg.core.boundary import boundary
+from splatseg.core.gaussians import no_gaussians
 from splatseg.core.json_values import MAX_NUMBER
+from splatseg.core.options import Natural
 from splatseg.errors import InputError, MissingFileError
 from splatseg.io.atomic import (
     atomic_folder,
@@ -42,6 +45,13 @@ from splatseg.io.atomic import (
     sync_tree,
 )
 from splatseg.io.cameras import cameras_content, relative_path, source_paths, views_from_content
+from splatseg.io.chunks import (
+    CHUNKS_FOLDER,
+    INDEX_FILE,
+    is_in_chunks,
+    level_folder,
+    open_chunks,
+)
 from splatseg.io.foreign import derived_from, expect, is_file, is_folder
 from splatseg.io.json_files import check_version, read_json, write_json
 from splatseg.io.layers import load_layer, save_layer
@@ -95,6 +105,17 @@ class _SceneFile:
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]{0,199}")
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GaussiansToWrite:
+    """Gaussians of a new scene that are written in chunks, and not held."""
+
+    count: int
+    """How many there are."""
+
+    write: Callable[[Path], None]
+    """Writes them into an empty folder, see `io.chunks.ChunkWriter`."""
+
+
 @boundary
 def save_scene(
     scene: Scene,
@@ -126,6 +147,8 @@ def save_scene(
         if not folder.is_dir():
             raise InputError(f"{folder}: expected a folder of evidence, got none.")
     there = is_scene(root) or is_unfinished(root)
+    if is_in_chunks(root / CHUNKS_FOLDER):
+        raise InputError(f"{root}: expected a new folder, got a scene in chunks.")
     if there and evidence:
         raise InputError(f"{root}: expected a new folder to copy evidence to, got a scene.")
     if root.is_dir() and not there and not is_vacant(root):
@@ -141,8 +164,60 @@ def save_scene(
     return replace(scene, root=root)
 
 
+def _no_layers(_: Path) -> Iterable[tuple[str, Layer]]:
+    return ()
+
+
 @boundary
-def load_scene(root: Path | str, *, data: Path | str | None = None) -> Scene:
+def save_scene_in_chunks(
+    scene: Scene,
+    gaussians: GaussiansToWrite,
+    root: Path | str,
+    *,
+    layers: Callable[[Path], Iterable[tuple[str, Layer]]] = _no_layers,
+    evidence: Sequence[Path] = (),
+) -> None:
+    """Write a new scene folder whose Gaussians are in chunks, whole or not at all.
+
+    Args:
+        scene: The scene; its own Gaussians are not looked at.
+        gaussians: The Gaussians.
+        root: The folder.
+        layers: Gives layers of these Gaussians and their names, one after the other, of the folder
+            of the Gaussians that were written.
+        evidence: Folders of evidence, copied under their own names.
+
+    Raises:
+        InputError: If something is there already, or a layer has not one row a Gaussian.
+        MissingFileError: If the parent of `root` does not exist.
+        OutputError: If the disk is full, or there is no permission.
+    """
+    root = Path(root)
+    if root.exists() and not (root.is_dir() and is_vacant(root)):
+        raise InputError(f"{root}: expected a new folder, got one that is there.")
+    with atomic_folder(root, durable=True) as temporary:
+        folder = temporary / CHUNKS_FOLDER
+        folder.mkdir()
+        gaussians.write(folder)
+        written = len(open_chunks(folder, memory=1))
+        what = f"{gaussians.count} Gaussians to be written, got {written}"
+        expect(written == gaussians.count, "gaussians", what, error=InputError)
+        _write(scene, temporary, {}, final=root, count=gaussians.count)
+        for name, layer in layers(folder):
+            _check_layer(name, layer, gaussians.count)
+            save_layer(layer, temporary / "layers" / f"{name}.npz")
+        for each in evidence:
+            shutil.copytree(each, temporary / "evidence" / each.name)
+
+
+@boundary
+def load_scene(
+    root: Path | str,
+    *,
+    data: Path | str | None = None,
+    memory: int | None = None,
+    level: Natural = 0,
+) -> Scene:
     """Read a scene folder. Inverse of `save_scene`.
 
     Args:
@@ -150,6 +225,33 @@ def load_scene(root: Path | str, *, data: Path | str | None = None) -> Scene:
         data: The capture's folder, where its photographs moved. None looks where they were,
             seen from the scene first, then by the absolute path. Without them the scene opens
             all the same; reading a photograph then fails.
+        memory: Bytes that the Gaussians of a view may take, of a scene in chunks, which stay on
+            the disk; others are read as a whole all the same. None refuses a scene in chunks.
+        level: Of a scene in chunks a coarser level, which its layers are not of; 0 is all of it.
+
+    Raises:
+        InputError: If it is in chunks, and the caller cannot stream; or it has no such level.
+        MissingFileError: If there is no scene, or `data` lacks photographs of it.
+        FileFormatError: If a file of it is broken, or of a later version.
+    """
+    root = Path(root)
+    scene, count = load_scene_views(root, data=data)
+    gaussians = _gaussians(root, memory, level)
+    if level:
+        return replace(scene, gaussians=gaussians)
+    what = f"{count} Gaussians as {SCENE_FILE} says, got {len(gaussians)}"
+    name = GAUSSIANS_FILE if gaussians.chunks is None else CHUNKS_FOLDER
+    expect(len(gaussians) == count, root / name, what)
+    return replace(scene, gaussians=gaussians)
+
+
+@boundary
+def load_scene_views(root: Path | str, *, data: Path | str | None = None) -> tuple[Scene, int]:
+    """Read a scene folder but for its Gaussians: a scene without any, and how many it has.
+
+    Args:
+        root: The scene folder.
+        data: As for `load_scene`.
 
     Raises:
         MissingFileError: If there is no scene, or `data` lacks photographs of it.
@@ -163,17 +265,14 @@ def load_scene(root: Path | str, *, data: Path | str | None = None) -> Scene:
     views = views_from_content(
         cameras, folder=root / "cameras", source=source, path=root / CAMERAS_FILE
     )
-    gaussians = read_scene_splats(current_file(root, GAUSSIANS_FILE))
-    what = f"{content.gaussians} Gaussians as {SCENE_FILE} says, got {len(gaussians)}"
-    expect(len(gaussians) == content.gaussians, root / GAUSSIANS_FILE, what)
     of_view = {name: split for split, names in content.split.items() for name in names}
     once = sum(len(names) for names in content.split.values()) == len(views)
     what = f"a split that names each view of {CAMERAS_FILE} once"
     expect(once and set(of_view) == {view.name for view in views}, where, what)
     classes = None if content.classes is None else class_table(content.classes, where=str(where))
     with derived_from(where):
-        return Scene(
-            gaussians=gaussians,
+        scene = Scene(
+            gaussians=no_gaussians(),
             # The splits of scene.json come before those of the cameras file.
             views=tuple(replace(view, split=of_view[view.name]) for view in views),
             classes=classes,
@@ -183,6 +282,27 @@ def load_scene(root: Path | str, *, data: Path | str | None = None) -> Scene:
             root=root,
             provenance=content.provenance or {},
         )
+    return scene, content.gaussians
+
+
+def _gaussians(root: Path, memory: int | None, level: int) -> Gaussians:
+    folder, file = root / CHUNKS_FOLDER, current_file(root, GAUSSIANS_FILE)
+    if not folder.is_dir():
+        if level:
+            raise InputError(f"level: goes with a scene in chunks, got {level} of {root}.")
+        return read_scene_splats(file)
+    expect(not file.is_file(), root, f"{GAUSSIANS_FILE} or {CHUNKS_FOLDER}/{INDEX_FILE}, got both")
+    if memory is None:
+        raise InputError(
+            f"{root}: its Gaussians are in chunks, which this cannot stream; "
+            "`splatseg chunks SCENE -o NEW --whole` makes a scene that is read as a whole."
+        )
+    if level and not is_in_chunks(level_folder(folder, level)):
+        raise InputError(
+            f"level: expected one that {root} has, got {level}; `splatseg chunks --levels` makes "
+            "them."
+        )
+    return open_chunks(level_folder(folder, level), memory=memory)
 
 
 @boundary
@@ -258,14 +378,25 @@ def _replace(scene: Scene, root: Path, layers: Mapping[str, Layer]) -> None:
         finish_pending(root)
 
 
-def _write(scene: Scene, folder: Path, layers: Mapping[str, Layer], *, final: Path) -> None:
-    """Write into `folder`, with paths as they will be seen from `final`."""
+def _write(
+    scene: Scene,
+    folder: Path,
+    layers: Mapping[str, Layer],
+    *,
+    final: Path,
+    count: int | None = None,
+) -> None:
+    """Write into `folder`, with paths as they will be seen from `final`.
+
+    With a `count` the Gaussians are there already.
+    """
     for name in FOLDERS:
         (folder / name).mkdir(exist_ok=True)
     final, source = final.absolute(), scene.source and scene.source.absolute()
     views = [_absolute(view) for view in scene.views]
     cameras = cameras_content(views, folder=final / "cameras", source=source)
-    write_splats(scene.gaussians, folder / GAUSSIANS_FILE)
+    if count is None:
+        write_splats(scene.gaussians, folder / GAUSSIANS_FILE)
     write_json(cameras, folder / CAMERAS_FILE)
     for name, layer in layers.items():
         save_layer(layer, folder / "layers" / f"{name}.npz")
@@ -274,7 +405,7 @@ def _write(scene: Scene, folder: Path, layers: Mapping[str, Layer], *, final: Pa
         {
             "format": FORMAT,
             "version": VERSION,
-            "gaussians": len(scene.gaussians),
+            "gaussians": len(scene.gaussians) if count is None else count,
             "source": None
             if source is None
             else {"relative": relative_path(source, start=final), "absolute": source.as_posix()},

@@ -95,6 +95,9 @@ def label_map(
 
 def view_label_map(view: PreparedView, labels: Labels) -> LabelMap:
     """`label_map` of a view that is prepared, for any number of layers."""
+    if view.part is not None:
+        # The ids of what was read for the view are all that it can show.
+        labels, view = labels[view.part.rows], view.part.view()
     named = labels.ids if labels.candidates is None else labels.candidates
     ids = torch.unique(torch.cat((torch.unique(named.cpu()), torch.tensor([labels.background]))))
     none = torch.tensor([UNLABELLED])

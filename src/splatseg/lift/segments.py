@@ -85,13 +85,19 @@ class EvidenceSegments:
         return {track.id: ids[track.category] for track in evidence.tracks if track.category in ids}
 
 
-def reduced_segments(segments: LabelMap | MaskSet, longest: int) -> LabelMap | MaskSet:
-    """Segments on a coarser grid: each pixel takes what is at its middle."""
-    height, width = segments.height, segments.width
+def reduced_size(height: int, width: int, longest: int) -> tuple[int, int]:
+    """Height and width in proportion, neither longer than that."""
     share = longest / max(height, width)
     if share >= 1:
+        return height, width
+    return max(1, round(share * height)), max(1, round(share * width))
+
+
+def reduced_segments(segments: LabelMap | MaskSet, longest: int) -> LabelMap | MaskSet:
+    """Segments on a coarser grid: each pixel takes what is at its middle."""
+    h, w = reduced_size(segments.height, segments.width, longest)
+    if (h, w) == (segments.height, segments.width):
         return segments
-    h, w = max(1, round(share * height)), max(1, round(share * width))
 
     def taken(picture: Tensor) -> Tensor:
         return at_middles(picture, h, w)

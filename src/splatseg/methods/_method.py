@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, fields, is_dataclass
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Literal, cast
 
-from splatseg.core import LOCAL, ClassTable, Executor, Features, Gaussians, Layer, View
+from splatseg.core import LOCAL, Camera, ClassTable, Executor, Features, Gaussians, Layer, View
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.checkpoints import Checkpoints
 from splatseg.errors import InputError, MissingPackageError
@@ -184,6 +184,11 @@ class Method:
 
     complete: bool = True
     """Whether Gaussians that no view explains take the labels of their neighbours by default."""
+
+    camera: Callable[[MethodInputs, Any, View], Camera] | None = None
+    """The camera, of the inputs and the options, through which it looks at a view, where all that
+    it asks of Gaussians is what these cameras see: of a scene in chunks it is given those that are
+    seen. None where it needs them all."""
 
     def __post_init__(self) -> None:
         convert_fields(self)

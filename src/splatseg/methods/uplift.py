@@ -7,6 +7,7 @@ import torch
 
 from splatseg.core import (
     LOCAL,
+    Camera,
     ClassTable,
     Executor,
     Features,
@@ -14,6 +15,7 @@ from splatseg.core import (
     Labels,
     LabelSource,
     View,
+    camera_of_map,
 )
 from splatseg.core.options import options
 from splatseg.errors import InputError
@@ -112,6 +114,13 @@ def run(inputs: MethodInputs, options: UpliftMethodOptions) -> Labels:
     )
 
 
+def camera(inputs: MethodInputs, options: UpliftMethodOptions, view: View) -> Camera:
+    """The camera of a view's label map."""
+    del options  # each map is lifted as it is
+    label_map = inputs.evidence.label_map(view.name)
+    return camera_of_map(view, label_map.height, label_map.width)
+
+
 def update(inputs: MethodInputs, options: UpliftMethodOptions, layer: Labels) -> Labels:
     """Add the votes of further views, see `with_votes`; the ids known are not relabelled again."""
     votes = uplift(
@@ -138,6 +147,7 @@ METHOD = Method(
     update=update,
     keeps_ids=True,
     published=UpliftMethodOptions(correct_confusion=False),
+    camera=camera,
 )
 
 

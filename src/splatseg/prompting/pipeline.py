@@ -41,6 +41,7 @@ from splatseg.prompting.graph import (
     build_graph,
     complete_membership,
     graph_cut,
+    graph_near,
     holes,
     specks,
 )
@@ -126,6 +127,7 @@ class SceneIndex:
         self._gaussians = gaussians
         self._index: NeighbourIndex | None = None
         self._graph: NeighbourGraph | None = None
+        self._near: tuple[Tensor, NeighbourGraph] | None = None
 
     @property
     def index(self) -> NeighbourIndex:
@@ -140,6 +142,19 @@ class SceneIndex:
         if self._graph is None:
             self._graph = build_graph(self._gaussians)
         return self._graph
+
+    def graph_around(self, mask: Bool[Tensor, "n"]) -> NeighbourGraph:
+        """The graph, as far as it is needed for what is decided at some Gaussians.
+
+        Of Gaussians on the disk it has those around them (`graph_near`), and others have no
+        neighbours: what is farther away and has one of these among its own nearest is not known to.
+        """
+        chunks = self._gaussians.chunks
+        if chunks is None:
+            return self.graph
+        if self._near is None or bool((mask & ~self._near[0]).any()):
+            self._near = mask, graph_near(self._gaussians, chunks, mask)
+        return self._near[1]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -294,9 +309,8 @@ def filtered(confidence: Float[Tensor, "n"], context: SelectionContext) -> Float
         return _with_mask(confidence, kept)
     selection = Selection(mask=mask)
     clicked = context.pointed_at(positive=True) & selection
-    return _with_mask(
-        confidence, mask & ~specks(context.neighbours.graph, selection, clicked=clicked).mask
-    )
+    graph = context.neighbours.graph_around(mask)
+    return _with_mask(confidence, mask & ~specks(graph, selection, clicked=clicked).mask)
 
 
 def grown(confidence: Float[Tensor, "n"], context: SelectionContext) -> Float[Tensor, "n"]:
@@ -325,7 +339,8 @@ def refined(confidence: Float[Tensor, "n"], context: SelectionContext) -> Float[
 def filled(confidence: Float[Tensor, "n"], context: SelectionContext) -> Float[Tensor, "n"]:
     """Without holes; what a negative prompt shows is none."""
     selection = Selection(mask=confidence > 0.5)
-    found = holes(context.neighbours.graph, selection) - context.pointed_at(positive=False)
+    graph = context.neighbours.graph_around(selection.mask)
+    found = holes(graph, selection) - context.pointed_at(positive=False)
     return _with_mask(confidence, selection.mask | found.mask)
 
 

@@ -80,7 +80,8 @@ class ViewCache:
     ) -> None:
         self._gaussians = gaussians
         self._backend = backend
-        self._capacity = capacity
+        # A view of a scene in chunks holds what it read, and the memory is for one.
+        self._capacity = capacity if gaussians.chunks is None else 1
         self._edited = edited or _as_it_is
         # Camera and edit are kept as long as their numbers are a key, which therefore is nobody
         # else's.

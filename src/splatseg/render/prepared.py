@@ -5,16 +5,17 @@ For a camera with distortion the view is the product of two sparse matrices, :ma
 identity and nothing is resampled. The warp depends on the lens alone and is kept by itself.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Self
 
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, Int64, UInt8
 from torch import Tensor
 
 from splatseg._check import check_shape
 from splatseg.core import Camera, Gaussians
 from splatseg.core.boundary import boundary
+from splatseg.core.chunks import rows_of
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.render._backend import (
     Backend,
@@ -29,6 +30,7 @@ from splatseg.render._backend import (
     options_for,
 )
 from splatseg.render._picture import eight_bits, mixed_colours, without_hidden
+from splatseg.render._row_view import RowsView
 from splatseg.render._rows import SparseWeights
 from splatseg.render._values import (
     BackProjected,
@@ -79,10 +81,54 @@ def prepare(
         >>> tuple(drawn.image.shape), tuple(back.sums.shape)
         ((9, 9, 5), (1, 5))
     """
-    check_scene(gaussians)
+    if gaussians.chunks is None:
+        check_scene(gaussians)
     chosen = get_backend(backend, like=gaussians.means)
     options = options or options_for(gaussians, backend)
-    return PreparedView(gaussians, camera, options=options, backend=chosen)
+    chunks = gaussians.chunks
+    if chunks is None:
+        return PreparedView(gaussians, camera, options=options, backend=chosen)
+    runs = chunks.view_of(
+        undistorted_camera(camera),
+        near=options.near,
+        low_pass=options.low_pass,
+        coefficients=gaussians.sh.shape[1],
+    )
+
+    def read(colours: bool) -> PreparedView:
+        near = chunks.read(runs, colours=colours)  # with sound values
+        return PreparedView(near, camera, options=options, backend=chosen)
+
+    part = ViewPart(rows_of(runs), read)
+    return PreparedView(gaussians, camera, options=options, backend=chosen, part=part)
+
+
+class ViewPart:
+    """A view of the Gaussians that are read from the disk for it, when they are first needed.
+
+    Args:
+        rows: Which row of the scene each of its Gaussians is, ascending.
+        read: Makes the view, with colours or without; harmonics are most of what there is to read.
+    """
+
+    def __init__(self, rows: Int64[Tensor, "m"], read: "Callable[[bool], PreparedView]") -> None:
+        self.rows = rows
+        self._read = read
+        self._view: PreparedView | None = None
+        self._coloured = False
+
+    def view(self, *, colours: bool = False) -> "PreparedView":
+        """The view, which stays open; without `colours` the Gaussians may have none."""
+        if self._view is None or (colours and not self._coloured):
+            self.close()
+            self._view, self._coloured = self._read(colours), colours
+        return self._view
+
+    def close(self) -> None:
+        """Release its memory."""
+        if self._view is not None:
+            self._view.close()
+            self._view = None
 
 
 class PreparedView:
@@ -90,14 +136,26 @@ class PreparedView:
 
     @boundary
     def __init__(
-        self, gaussians: Gaussians, camera: Camera, *, options: RenderOptions, backend: Backend
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        *,
+        options: RenderOptions,
+        backend: Backend,
+        part: ViewPart | None = None,
     ) -> None:
         """Take what `prepare` checked; nothing is projected before it is needed."""
         self._gaussians, self._options, self._backend = gaussians, options, backend
         self._count = len(gaussians)
         self._device = gaussians.device
         self._camera = camera
-        self._view = backend.prepare(gaussians, undistorted_camera(camera), options=options)
+        self._part = part
+        pinhole = undistorted_camera(camera)
+        self._view: BackendView = (
+            backend.prepare(gaussians, pinhole, options=options)
+            if part is None
+            else RowsView(part, count=len(gaussians), camera=pinhole)
+        )
         self._shown: tuple[Tensor, BackendView] | None = None
 
     def __enter__(self) -> Self:
@@ -116,6 +174,19 @@ class PreparedView:
     def camera(self) -> Camera:
         """The camera of the view's pixels."""
         return self._camera
+
+    @property
+    def part(self) -> ViewPart | None:
+        """Of a scene on the disk the view of what was read; None where all are in memory.
+
+        Work that goes with the Gaussians of a view, and not with those of the scene, is done there.
+        """
+        return self._part
+
+    @property
+    def own(self) -> BackendView:
+        """The backend's view."""
+        return self._view
 
     @boundary
     def render(
@@ -194,6 +265,13 @@ class PreparedView:
             ([126, 126, 126], [252, 0, 0])
         """
         check_picture(self._count, tint=tint, signal=signal, shown=shown)
+        if self._part is not None:
+            tint, signal, shown = (
+                None if column is None else column[self._part.rows]
+                for column in (tint, signal, shown)
+            )
+            view = self._part.view(colours=signal is None)
+            return view.picture(tint, signal=signal, shown=shown)
         view, gaussians = self._view, self._gaussians
         if shown is not None and not bool(shown.all()):
             gaussians = without_hidden(gaussians, shown)

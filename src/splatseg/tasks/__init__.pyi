@@ -2,12 +2,16 @@ from .attach import AttachedLayers as AttachedLayers
 from .attach import AttachLayersOptions as AttachLayersOptions
 from .attach import attach_layers as attach_layers
 from .checkpoints import CheckpointOptions as CheckpointOptions
+from .chunks import ChunkedScene as ChunkedScene
+from .chunks import ChunkOptions as ChunkOptions
+from .chunks import chunk_scene as chunk_scene
 from .demo import Demo as Demo
 from .demo import DemoOptions as DemoOptions
 from .demo import make_demo as make_demo
 from .describe import describe as describe
 from .edit import EditedScene as EditedScene
 from .edit import edit_scene as edit_scene
+from .edit_chunks import edit_chunks as edit_chunks
 from .edit_operations import EditOptions as EditOptions
 from .evaluate import EvaluationOptions as EvaluationOptions
 from .evaluate import evaluate_scene as evaluate_scene

@@ -26,6 +26,7 @@ from splatseg.io.captures import FORMATS, bare_photographs, find_formats, read_c
 from splatseg.io.evidence import Evidence, evidence_names, open_evidence
 from splatseg.io.images import DEFAULT_LONGEST, image_size
 from splatseg.io.layers import load_layer
+from splatseg.io.limits import memory_to_use
 from splatseg.io.scene import (
     DRIVE_FILE,
     load_scene,
@@ -97,7 +98,8 @@ def describe(
 
 def _describe_folder(path: Path, format: str, *, strict: bool) -> dict[str, Any]:
     if format == "auto" and is_scene(path):
-        return _scene_facts(load_scene(path))
+        # Nothing that is told of Gaussians needs them in memory.
+        return _scene_facts(load_scene(path, memory=memory_to_use(None)))
     if format == "auto" and is_unfinished(path):
         return _unfinished_facts(path)
     if format != "auto" or find_formats(path):
@@ -330,6 +332,7 @@ def _gaussian_facts(gaussians: Gaussians) -> dict[str, Any]:
         "sh_degree": gaussians.sh_degree,
         "bounds": bounds,
         "extra_columns": sorted(gaussians.extra),
+        "chunks": None if gaussians.chunks is None else len(gaussians.chunks),
     }
 
 

@@ -175,7 +175,8 @@ def edit_scene(
         after, done = _edited(document, options, cut, backend, observer)
     with observer.stage("pictures"):
         pictures = draw_edit(document.scene, after.scene, views=options.pictures, backend=backend)
-    saved = save_document(_with_base(root, folder, document, after), folder)
+    based = with_base(root, folder, document.scene, after.scene)
+    saved = save_document(replace(after, scene=based), folder)
     report = None
     if pictures is not None:
         counts = (len(document.scene.gaussians), len(after.scene.gaussians))
@@ -262,19 +263,25 @@ def _with_result(document: Document, measured: Mapping[str, float]) -> Document:
     return replace(document, scene=replace(document.scene, provenance=provenance))
 
 
-def _with_base(root: Path, folder: Path, before: Document, after: Document) -> Document:
-    """The document with where the scene was before its first edit."""
-    edited = isinstance(before.scene.provenance.get(BASE), Mapping)
+def with_base(root: Path, folder: Path, before: Scene, after: Scene) -> Scene:
+    """The scene after an edit, with where it was before its first edit.
+
+    Args:
+        root: Folder of the scene that was edited.
+        folder: Where the new one is to be.
+        before: The one that was edited.
+        after: The new one.
+    """
+    edited = isinstance(before.provenance.get(BASE), Mapping)
     place = _base_of(root, before) if edited else root.resolve()
     relative = Path(os.path.relpath(place, folder.resolve())).as_posix()
     base = {"relative": relative, "absolute": place.as_posix()}
-    provenance = dict(after.scene.provenance) | {BASE: base}
-    return replace(after, scene=replace(after.scene, provenance=provenance))
+    return replace(after, provenance=dict(after.provenance) | {BASE: base})
 
 
-def _base_of(root: Path, document: Document) -> Path:
+def _base_of(root: Path, scene: Scene) -> Path:
     """Folder of the scene that was edited first, seen from `root` before its absolute place."""
-    entry = document.scene.provenance.get(BASE)
+    entry = scene.provenance.get(BASE)
     if not isinstance(entry, Mapping):
         raise InputError(f"{root}: expected a scene with an edit to undo, got one without.")
     table = cast("Mapping[str, Any]", entry)
@@ -288,7 +295,7 @@ def _base_of(root: Path, document: Document) -> Path:
 def _undone(
     root: Path, document: Document, data: Path | None, backend: BackendName, observer: Observer
 ) -> tuple[Document, list[Mapping[str, Any]]]:
-    base = _base_of(root, document)
+    base = _base_of(root, document.scene)
     if not is_scene(base):
         raise MissingFileError(
             f"{base}: the scene that was edited first is not there; undo does its edits again."

@@ -12,6 +12,7 @@ from splatseg.core import TREE_LEVELS, Features, InstanceTree, Layer, Scene
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError
 from splatseg.io.atomic import named_write_failures
+from splatseg.io.chunks import CHUNKS_FOLDER
 from splatseg.io.evidence import Evidence
 from splatseg.io.export import (
     check_beside,
@@ -42,7 +43,14 @@ from splatseg.tasks.export_labels import (
 from splatseg.tasks.export_meshes import export_meshes
 from splatseg.tasks.render import Rendering, RenderingOptions, render_views
 from splatseg.tasks.segment import Segmentation
-from splatseg.tasks.work import EXPORTS_FOLDER, REPORTS_FOLDER, SILENT, Observer, Work
+from splatseg.tasks.work import (
+    EXPORTS_FOLDER,
+    REPORTS_FOLDER,
+    SILENT,
+    Observer,
+    Work,
+    check_streams,
+)
 
 _NOTES = 3
 
@@ -93,6 +101,8 @@ def export_scene(
             lies in the way.
     """
     options = options or ExportOptions()
+    if what in ("meshes", "points"):
+        check_streams(scene, f"what {what}")
     _check(scene, output, what, options)
     work = Work(scene=scene, layers=layers, backend=backend, observer=observer)
     job = open_job(work, output, what, options, files=files or {})
@@ -131,7 +141,9 @@ def _check_place(scene: Scene, output: Path, what: What) -> None:
         check_replaceable(output, "panoptic.json")
     if scene.root is not None:
         own = (scene.root / "gaussians.ply", scene.root / "scene.json", scene.root)
-        if output.resolve() in {path.resolve() for path in own}:
+        chunks = scene.root / CHUNKS_FOLDER
+        place = output.resolve()
+        if place in {path.resolve() for path in own} or place.is_relative_to(chunks.resolve()):
             raise InputError(f"{output}: is the scene's own; choose another name.")
 
 

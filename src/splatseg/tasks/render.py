@@ -45,10 +45,17 @@ from splatseg.io.images import check_encoder, save_png, write_video
 from splatseg.io.json_files import read_json, write_json
 from splatseg.io.surfaces import read_surface
 from splatseg.lift import GaussianField
-from splatseg.render import BackendName
+from splatseg.render import BackendName, prepare
 from splatseg.report.colours import colour_labels, layer_colours, legend_of
 from splatseg.report.images import colour_depth
-from splatseg.tasks.work import SILENT, Observer, Work, check_parent_writable, scene_of_capture
+from splatseg.tasks.work import (
+    SILENT,
+    Observer,
+    Work,
+    check_parent_writable,
+    check_streams,
+    scene_of_capture,
+)
 
 # Depths beyond these shares of all are shown in the end colours.
 _NEAR, _FAR = 0.01, 0.99
@@ -124,7 +131,9 @@ def _read(file: Path) -> np.ndarray:
         return np.array(image).astype(np.float64)
 
 
-_PICTURES = ("rgb", "depth", "alpha")
+PICTURES = ("rgb", "depth", "alpha")
+"""What is drawn of Gaussians without a layer."""
+
 _RECORD = "render.json"
 _CAMERAS = "transforms.json"
 _SOLID = 0.5
@@ -210,11 +219,13 @@ def render_views(
         InputError: If there is no such layer or split, or something else lies in the way.
     """
     options = options or RenderingOptions()
+    if executor is not LOCAL:
+        check_streams(scene, "executor")
     work = Work(scene=scene, layers=layers, backend=backend, observer=observer)
     if not options.what:
         raise InputError("what: expected rgb, depth, alpha or names of layers, got nothing.")
     wanted = list(dict.fromkeys(options.what))
-    names = [name for name in wanted if name not in _PICTURES]
+    names = [name for name in wanted if name not in PICTURES]
     _check_layers(names, {*(work.layer_names if field is None else field.layer_names)})
     if field is None:
         field = work.field(names)
@@ -227,6 +238,9 @@ def render_views(
     films = [name for name in wanted if options.video]
     files = [f"{name}.mp4" for name in films] + ([_CAMERAS] if on_path else [])
     record = _check_output(output, folders, files)
+    if scene.gaussians.chunks is not None:
+        for view in views:  # nothing is read: what does not fit is said before the work
+            prepare(scene.gaussians, view.camera, backend=backend).close()
     output.mkdir(parents=True, exist_ok=True)
     try:
         _render(
@@ -322,7 +336,7 @@ def _check_layers(names: Sequence[str], known: set[str]) -> None:
     for name in names:
         if name.partition("@")[0] not in known:
             raise InputError(
-                f"what: expected {', '.join(_PICTURES)} or a layer of the scene "
+                f"what: expected {', '.join(PICTURES)} or a layer of the scene "
                 f"({', '.join(sorted(known)) or 'it has none'}), got {name!r}."
             )
 
@@ -369,7 +383,7 @@ def _check_output(output: Path, folders: Sequence[str], files: Sequence[str]) ->
 
 
 def _draw_pictures(looked_at: RenderableView, view: View, into: Mapping[str, Path]) -> None:
-    if not any(name in into for name in _PICTURES):
+    if not any(name in into for name in PICTURES):
         return
     shown = looked_at.signals(colour="rgb" in into)
     if "rgb" in into:

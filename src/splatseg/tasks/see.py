@@ -38,7 +38,14 @@ from splatseg.models import (
 )
 from splatseg.models.recorded import recorded_model
 from splatseg.render import BackendName, PreparedView
-from splatseg.tasks.work import EVIDENCE_FOLDER, SILENT, Observer, Work, view_spec
+from splatseg.tasks.work import (
+    EVIDENCE_FOLDER,
+    SILENT,
+    Observer,
+    Work,
+    check_streams,
+    view_spec,
+)
 
 T = TypeVar("T")
 
@@ -140,6 +147,8 @@ def see(
         BackendError: If an image does not fit the memory of the device.
     """
     options = options or SeeOptions()
+    if executor is not LOCAL:
+        check_streams(scene, "executor")
     work = Work(scene=scene, backend=backend, observer=observer)
     check_name("evidence", evidence)
     root = work.root

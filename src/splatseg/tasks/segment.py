@@ -32,6 +32,7 @@ from splatseg.lift.panoptic import merge_panoptic
 from splatseg.methods import Method, MethodInputs, Refined, find_method
 from splatseg.render import BackendName
 from splatseg.tasks.checkpoints import CheckpointOptions, training_checkpoints, with_resume_hint
+from splatseg.tasks.segment_chunks import check_streamed, run_on_seen
 from splatseg.tasks.segment_inputs import (
     check_fit,
     classes_to_merge,
@@ -210,6 +211,8 @@ def segment_work(
         zero_is_class=options.zero_is_class,
         void=options.void,
     )
+    completes = options.complete and method.complete and not options.published
+    check_streamed(work, method, options, completes=completes)
     merged = classes_to_merge(work, evidence, options.classes)
     check_name("layer", layer_name := options.layer or name)
     views = views_to_lift(work, evidence, options.views)
@@ -244,7 +247,9 @@ def segment_work(
         began = time.monotonic()
         with work.observer.stage("segment") as step:
             inputs = replace(inputs, progress=step)
-            if before is None or method.update is None:
+            if scene.gaussians.chunks is not None:
+                layer = run_on_seen(inputs, method, chosen, scene.gaussians.chunks)
+            elif before is None or method.update is None:
                 layer = method.run(inputs, chosen)
             else:
                 layer = method.update(inputs, chosen, before)
@@ -252,7 +257,7 @@ def segment_work(
         if isinstance(layer, Refined):
             scene = refined = replace(scene, gaussians=layer.gaussians)
             layer = layer.layer
-        if options.complete and method.complete and not options.published:
+        if completes:
             began = time.monotonic()
             layer = _completed(scene, layer)
             timings["complete"] = time.monotonic() - began

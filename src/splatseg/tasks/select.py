@@ -50,7 +50,7 @@ from splatseg.tasks.sources import (
     SourceRequest,
     open_source,
 )
-from splatseg.tasks.work import SILENT, Observer, Work, layer_versions
+from splatseg.tasks.work import SILENT, Observer, Work, check_streams, layer_versions
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -182,6 +182,8 @@ class SelectionSession:
         self._check_source(options)
         given = requested = _as_prompts(prompts)
         check_base(self._work.scene, base, options)
+        if advise:
+            check_streams(self._work.scene, "next_click")
         seconds: dict[str, float] = {}
         if self._prompter is not None and not self._propagates(given):
             began = time.perf_counter()

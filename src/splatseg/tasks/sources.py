@@ -32,7 +32,7 @@ from splatseg.prompting.seen import ViewCache
 from splatseg.tasks.see import shown_image
 from splatseg.tasks.segment import SegmentOptions, segment_work
 from splatseg.tasks.word_sources import several_masks
-from splatseg.tasks.work import Work
+from splatseg.tasks.work import Work, check_streams
 
 SelectMode = Literal["new", "add", "subtract", "intersect"]
 SelectThreshold = Literal["auto", "fixed", "adaptive"]
@@ -218,6 +218,8 @@ def _open_features(request: SourceRequest) -> OpenedSource | None:
     if name is None:
         return None
     layer = work.layer(name, option="from_layer")
+    if isinstance(layer, Features | VoxelFeatures):
+        check_streams(work.scene, "source features")
     if isinstance(layer, VoxelFeatures):
         layer = layer.features()
     if not isinstance(layer, Features):
@@ -307,6 +309,7 @@ def _open_propagate(request: SourceRequest) -> OpenedSource | None:
             "prompter: expected a model for source propagate, such as classical or recorded masks, "
             "got none."
         )
+    check_streams(work.scene, "source propagate")
     source = PropagatedMasks(
         work.scene.train_views,
         request.prompter,

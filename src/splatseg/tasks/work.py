@@ -26,6 +26,7 @@ from splatseg.core import (
     flat_layer,
     layer_address,
 )
+from splatseg.core.gaussians import no_gaussians
 from splatseg.errors import InputError, RangeError
 from splatseg.evaluate.photographs import MaskUse
 from splatseg.io.atomic import atomic_file, check_utf8, check_writable, is_vacant, sweep
@@ -306,6 +307,23 @@ def scene_field(scene: Scene, name: str, *, vertex_rule: "VertexRule | None" = N
     return load_mesh_field(path).with_layer(vertex_rule=vertex_rule)
 
 
+def check_streams(scene: Scene, what: str) -> None:
+    """Refuse for a scene in chunks what would read all of its Gaussians.
+
+    Args:
+        scene: The scene.
+        what: What was asked for, as people write it, and how to do without; begins the sentence.
+
+    Raises:
+        InputError: If its Gaussians are in chunks.
+    """
+    if scene.gaussians.chunks is not None:
+        raise InputError(
+            f"{what}: needs all Gaussians at once, and these are in chunks; `splatseg chunks "
+            "SCENE -o NEW --whole` makes a scene that is read as a whole."
+        )
+
+
 def source_views(scene: Scene, info: LayerInfo, evidence: Evidence) -> tuple[View, ...]:
     """Views with evidence that made a layer, where it says which; else the training views."""
     known = set(evidence.view_names)
@@ -356,17 +374,8 @@ def scene_of_capture(capture: Capture, gaussians: Gaussians | None = None, **mor
         gaussians: Its Gaussians; None is none, a scene of views alone.
         more: Further fields of the scene.
     """
-    if gaussians is None:
-        nothing = torch.zeros(0, 3)
-        gaussians = Gaussians(
-            means=nothing,
-            rotations=torch.zeros(0, 4),
-            scales=nothing,
-            opacities=torch.zeros(0),
-            sh=torch.zeros(0, 1, 3),
-        )
     known = Scene(
-        gaussians=gaussians,
+        gaussians=no_gaussians() if gaussians is None else gaussians,
         views=capture.views,
         classes=capture.classes,
         up=capture.up,

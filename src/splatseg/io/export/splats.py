@@ -148,6 +148,8 @@ def write_labelled_splats(
         )
     check_parent(path)
     labelled = gaussians.replace(extra=dict(gaussians.extra) | dict(columns))
+    if gaussians.chunks is not None:
+        labelled = labelled.in_chunks(gaussians.chunks)  # no column that they read has changed
     if table is None:
         write_splats(labelled, path, format=format)
         return None

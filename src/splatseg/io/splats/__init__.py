@@ -152,6 +152,36 @@ def read_scene_splats(path: StrPath) -> Gaussians:
 
 
 @boundary
+def splat_rows(path: StrPath, *, own: bool = False) -> tuple[Callable[[int, int], Gaussians], int]:
+    """What reads some rows of a PLY file, from one to before another, and how many rows there are.
+
+    Args:
+        path: The file.
+        own: Whether splatseg wrote it: nothing in it is doubted.
+
+    Raises:
+        InputError: If it is of another format, or of text.
+        FileFormatError: If it is damaged, or holds a Gaussian that cannot be rendered, when that is
+            read.
+        MissingFileError: If there is no such file.
+    """
+    source = Path(path)
+    format = splat_format(source)
+    header = read_ply_header(source) if format == "ply" else None
+    vertex = None if header is None else header.element("vertex")
+    if header is None or not header.order or vertex is None:
+        raise InputError(
+            f"{source}: expected a binary PLY file to read some rows of, got another file; "
+            "`splatseg import` reads it as a whole."
+        )
+
+    def rows(first: int, end: int) -> Gaussians:
+        return read_ply(source, header, strict=True, own=own, part=slice(first, end))
+
+    return rows, vertex.count
+
+
+@boundary
 def write_splats(
     gaussians: Gaussians, path: StrPath, *, format: WritableFormat | None = None
 ) -> None:
@@ -189,6 +219,11 @@ def write_splats(
     target = Path(path)
     chosen = _format_of_name(target) if format is None else format
     check_choice("format", chosen, _WRITERS)
+    if gaussians.chunks is not None and chosen != "ply":
+        raise InputError(
+            f"{target}: expected a .ply file for Gaussians in chunks, as other formats need all of "
+            f"them at once, got {chosen}."
+        )
     writer = _WRITERS[chosen]
     losses = Losses(target, writer.label)
     with atomic_file(target) as temporary:

@@ -174,7 +174,7 @@ class Rows:
         if opacities:
             self.opacities[:] = sigmoid(self.opacities)
 
-    def __getitem__(self, kept: NDArray[np.bool_]) -> "Rows":
+    def __getitem__(self, kept: NDArray[np.bool_] | slice) -> "Rows":
         """Some of the rows."""
         return Rows(**{one.name: getattr(self, one.name)[kept] for one in fields(self)})
 

@@ -172,6 +172,7 @@ def read_ply(
     strict: bool,
     linear: Collection[str] = (),
     own: bool = False,
+    part: slice = slice(None),
 ) -> Gaussians:
     """Read Gaussians and their extra columns from a PLY file, binary or ASCII.
 
@@ -184,26 +185,27 @@ def read_ply(
         strict: Refuse rows that cannot be rendered instead of leaving them out.
         linear: Which of scales and opacities the file has as they are, not as logs and logits.
         own: Whether splatseg wrote it: nothing in it is doubted, and no column is a filter.
+        part: The rows that are read; of a binary file no others are looked at.
     """
     vertex, columns = _find_columns(path, header, own=own)
     rendered_degree(path, MAX_DEGREE + 1 if columns.beyond else 0, strict=strict)
     kinds = vertex.dtype()
     table = read_ply_tables(path, header, ["vertex"], whole=True)["vertex"].numbers
-    rows = Rows.empty(vertex.count, 1 + len(columns.rest) // 3)
-    filters = np.zeros(vertex.count, np.float32)
+    table = {name: values[part] for name, values in table.items()}
+    count = len(range(*part.indices(vertex.count)))
+    rows = Rows.empty(count, 1 + len(columns.rest) // 3)
+    filters = np.zeros(count, np.float32)
     extra = {
-        name: np.empty(vertex.count, kinds[name])
-        for name in vertex.names
-        if name not in columns.used
+        name: np.empty(count, kinds[name]) for name in vertex.names if name not in columns.used
     }
-    for part in blocks(vertex.count, BLOCK // 4):
-        block = {name: values[part] for name, values in table.items()}
+    for some in blocks(count, BLOCK // 4):
+        block = {name: values[some] for name, values in table.items()}
         with np.errstate(over="ignore"):  # text may have numbers beyond float32
-            _unpack(block, rows, part, columns)
+            _unpack(block, rows, some, columns)
             if columns.filter_3d is not None:
-                filters[part] = block[columns.filter_3d]
+                filters[some] = block[columns.filter_3d]
             for name, column in extra.items():
-                column[part] = block[name]
+                column[some] = block[name]
     too_large = columns.coloured and bool((rows.sh[:, 0] > 0.5 / SH_C0 + 1e-3).any())
     what = f"real colours {' '.join(columns.dc)} in [0, 1], got larger ones"
     expect(not too_large, path, what)
@@ -415,9 +417,9 @@ def write_ply(gaussians: Gaussians, path: Path, *, losses: Losses) -> None:
         RangeError: If a row cannot be rendered.
     """
     del losses  # there are none
-    rows = to_rows(gaussians)
+    held = to_rows(gaussians) if gaussians.chunks is None else None
     extra, notes = _flatten(gaussians.extra)
-    count = rows.sh.shape[1] - 1
+    count = gaussians.sh.shape[1] - 1
     rest = tuple(f"f_rest_{i}" for i in range(3 * count))
     standard = (
         *_OWN["means"], *_NORMALS, *_OWN["dc"], *rest, "opacity", *_OWN["scales"],
@@ -431,19 +433,29 @@ def write_ply(gaussians: Gaussians, path: Path, *, losses: Losses) -> None:
         file.write(ply_header([("vertex", len(gaussians), fields)], comments))
         for part in blocks(len(gaussians), BLOCK // 4):
             block = np.zeros(part.stop - part.start, np.dtype(fields))
+            rows = _part(gaussians, held, part)
             for source, names in (
-                (rows.means[part], _OWN["means"]),
-                (rows.rotations[part], _OWN["rotations"]),
-                (logs(rows.scales[part]), _OWN["scales"]),
-                (rows.sh[part, 0], _OWN["dc"]),
-                (logits(rows.opacities[part])[:, None], ("opacity",)),
-                (rows.sh[part, 1:].transpose(0, 2, 1).reshape(len(block), -1), rest),
+                (rows.means, _OWN["means"]),
+                (rows.rotations, _OWN["rotations"]),
+                (logs(rows.scales), _OWN["scales"]),
+                (rows.sh[:, 0], _OWN["dc"]),
+                (logits(rows.opacities)[:, None], ("opacity",)),
+                (rows.sh[:, 1:].transpose(0, 2, 1).reshape(len(block), -1), rest),
             ):
                 for i, name in enumerate(names):
                     block[name] = source[:, i]
             for name, column in extra.items():
                 block[name] = column[part]
             file.write(block.tobytes())
+
+
+def _part(gaussians: Gaussians, held: Rows | None, part: slice) -> Rows:
+    """Some rows, of those that are held, or read from the disk."""
+    if held is not None:
+        return held[part]
+    if gaussians.chunks is None:
+        raise InputError("gaussians: expected some in chunks, got others.")
+    return to_rows(gaussians.chunks.read([(part.start, part.stop)]))
 
 
 def _flatten(extra: Mapping[str, Tensor]) -> tuple[dict[str, np.ndarray], list[str]]:

@@ -241,7 +241,7 @@ class UpliftOptions:
     """FlashSplat's gamma, in [-1, 1], added to the votes against an id: above 0 labels are
     cut tight around what was seen, below 0 generously."""
 
-    memory: Count = 1 << 30
+    table_memory: Count = 1 << 30
     """Bytes of an exact table of votes, 4 for each id and Gaussian. With more ids than fit,
     each Gaussian remembers its strongest."""
 
@@ -300,7 +300,7 @@ def uplift(
         backend=backend,
     )
     slots = max(SLOTS, options.candidates)
-    table = VoteTable(len(gaussians), memory=options.memory, slots=slots)
+    table = VoteTable(len(gaussians), memory=options.table_memory, slots=slots)
     label_mass = LabelMass()
     visibility, squares = torch.zeros(len(gaussians)), torch.zeros(len(gaussians))
     voting = _Voting(adjoint=adjoint, evidence=evidence)

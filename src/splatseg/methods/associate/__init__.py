@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from splatseg.core import (
     LOCAL,
     UNLABELLED,
+    Camera,
     ClassTable,
     Executor,
     Gaussians,
@@ -38,11 +39,12 @@ from splatseg.core import (
     MaskSet,
     SegmentSource,
     View,
+    camera_of_map,
     tree_level,
     with_info,
 )
 from splatseg.core.options import Count, Share, options
-from splatseg.lift.segments import EvidenceSegments
+from splatseg.lift.segments import EvidenceSegments, reduced_size
 from splatseg.lift.voting.confusion import DEFAULT_CONFUSION, ConfusionOptions, correct_confusion
 from splatseg.methods._method import Method, MethodInputs
 from splatseg.methods.associate._clustering import cluster, nesting
@@ -368,6 +370,13 @@ def run(inputs: MethodInputs, options: AssociateMethodOptions) -> Labels | Insta
     )
 
 
+def camera(inputs: MethodInputs, options: AssociateMethodOptions, view: View) -> Camera:
+    """The camera of a view's segments, at the size at which they are read."""
+    segments = EvidenceSegments(evidence=inputs.evidence).segments_of(view.name)
+    size = reduced_size(segments.height, segments.width, options.association.longest_side)
+    return camera_of_map(view, *size)
+
+
 def update(
     inputs: MethodInputs, options: AssociateMethodOptions, layer: Labels | InstanceTree
 ) -> Labels | InstanceTree:
@@ -408,4 +417,5 @@ METHOD = Method(
     options=AssociateMethodOptions,
     run=run,
     update=update,
+    camera=camera,
 )

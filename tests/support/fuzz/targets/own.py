@@ -22,6 +22,7 @@ from splatseg.core import (
     VoxelGrid,
 )
 from splatseg.fit._checkpoint import FitState, read_checkpoint, write_checkpoint
+from splatseg.io.chunks import open_chunks, write_chunks
 from splatseg.io.export import column_table_of, write_column_table
 from splatseg.io.layers import load_layer, save_layer
 from splatseg.io.moving import read_moving
@@ -56,6 +57,26 @@ def _scene(name: str, file: str) -> None:
 
 _scene("scene.json", "scene.json")
 _scene("scene-cameras", "cameras/transforms.json")
+
+
+def _chunks(file: str) -> None:
+    @target(f"chunks-{file.partition('.')[0]}")
+    def make(folder: Path) -> Target:
+        chunks = folder / "gaussians"
+        chunks.mkdir()
+        write_chunks(lambda first, end: gaussians()[first:end], 4, chunks, memory=1)
+
+        def read() -> None:
+            found = open_chunks(chunks, memory=1)
+            if found.chunks is not None:
+                found.chunks.read([(0, len(found))])
+
+        return Target(file=chunks / file, read=read)
+
+
+_chunks("chunks.json")
+_chunks("means.npy")
+_chunks("sh.npy")
 
 
 def _layer(name: str, make_layer: Callable[[], Any]) -> None:
