@@ -215,6 +215,7 @@ def _votes_of(voting: _Voting, view: View) -> Iterator[LabelVotes]:
         "edge_vote": "every labelled pixel votes",
         "min_background": "a thousandth of the light must pass the Gaussians",
         "min_background_share": "the background label needs half of that light",
+        "memory": "it is called `table_memory`",
         "slots": "32 ids are remembered of each Gaussian, or as many as `candidates`",
     }
 )
