@@ -29,8 +29,9 @@ import numpy as np
 import torch
 
 from splatseg.core import UNLABELLED, Gaussians, Labels, LayerInfo, Scene, Similarity
+from splatseg.core.chunks import morton_order
 from splatseg.edit.history import moved_view
-from splatseg.io.chunks import CHUNK_ROWS, ChunkWriter, morton_order, open_chunks, write_chunks
+from splatseg.io.chunks import CHUNK_ROWS, ChunkWriter, open_chunks, write_chunks
 from splatseg.io.limits import parse_size
 from splatseg.io.scene import GaussiansToWrite, load_scene, save_scene_in_chunks
 from splatseg.io.splats import read_splats, write_splats

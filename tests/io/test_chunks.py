@@ -9,10 +9,11 @@ import pytest
 import torch
 
 from splatseg.core import Gaussians
+from splatseg.core.chunks import morton_order
 from splatseg.core.coarser import coarser
 from splatseg.errors import FileFormatError, InputError, MissingFileError, RangeError
 from splatseg.io import chunks as files
-from splatseg.io.chunks import ChunkWriter, level_folder, morton_order, open_chunks, write_chunks
+from splatseg.io.chunks import ChunkWriter, level_folder, open_chunks, write_chunks
 from support.chunked import in_chunks, in_memory
 
 COLUMNS = ("means", "rotations", "scales", "opacities", "sh")

@@ -157,6 +157,9 @@ def test_which_way_is_told(whole, chunked, tmp_path) -> None:
         chunk_scene(chunked.root, tmp_path / "made", memory=MEMORY)
     with pytest.raises(InputError, match="expected a scene in chunks with whole"):
         chunk_scene(whole, tmp_path / "made", options=ChunkOptions(whole=True), memory=MEMORY)
+    for given in ({"levels": 1}, {"harmonics": "float16"}):
+        with pytest.raises(InputError, match="whole: takes no"):
+            ChunkOptions(whole=True, **given)
     with pytest.raises(InputError, match="expected a new folder"):
         chunk_scene(whole, whole, memory=MEMORY)
     assert not (tmp_path / "made").exists()

@@ -21,10 +21,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int64
+from numpy.typing import NDArray
 from torch import Tensor
 
+from splatseg.core.boundary import boundary
 from splatseg.core.camera import Camera
 from splatseg.errors import InputError
 
@@ -165,3 +168,63 @@ class Chunks:
 def rows_of(runs: Sequence[tuple[int, int]]) -> Int64[Tensor, "m"]:
     """The rows of some runs, one run behind the other."""
     return torch.cat([torch.arange(0), *(torch.arange(*run) for run in runs)])
+
+
+_LARGE = 1 / 64
+"""Share of the Gaussians that stand apart because they are the largest: a chunk is seen from as far
+as its largest Gaussian."""
+
+_BITS = 21
+"""Of each coordinate on the Morton curve: three fit into 64."""
+
+_BLOCK = 1 << 18
+"""Rows whose places on the curve are found at once."""
+
+
+@boundary
+def morton_order(
+    means: Float[Tensor, "n 3"], largest: Float[Tensor, "n"]
+) -> tuple[Int64[Tensor, "n"], int]:
+    """The rows in the order in which chunks have them, and how many of the first stand apart.
+
+    Coordinates have 21 bits each in the box around all centres. Equal ones keep their order.
+
+    Args:
+        means: Centres.
+        largest: Largest standard deviation of each.
+
+    Returns:
+        The rows, those of the largest Gaussians first, and how many those are.
+
+    Example:
+        >>> corners = torch.tensor([[0.0, 0, 0], [1, 1, 1], [0, 0, 1], [0.1, 0, 0]])
+        >>> morton_order(corners, torch.ones(4))
+        (tensor([0, 3, 2, 1]), 0)
+    """
+    count = len(means)
+    codes = np.zeros(count, np.uint64)
+    if count:
+        low, high = (corner.double().numpy() for corner in torch.aminmax(means, dim=0))
+        scale = (2**_BITS - 1) / np.maximum(high - low, 1e-300)
+        for start in range(0, count, _BLOCK):
+            part = slice(start, start + _BLOCK)
+            cells = (means[part].double().numpy() - low) * scale
+            for axis in range(3):
+                codes[part] |= _spread(cells[:, axis].astype(np.uint64)) << np.uint64(axis)
+    apart = int(count * _LARGE)
+    if apart:
+        limit = float(largest.kthvalue(count - apart).values)
+        small = (largest > limit).logical_not().numpy()
+        apart = count - int(small.sum())
+        codes |= small.astype(np.uint64) << np.uint64(63)
+    return torch.from_numpy(np.argsort(codes, kind="stable")), apart
+
+
+def _spread(values: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """The 21 bits of numbers with two zeros between each two of them."""
+    for shift, mask in (
+        (32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F),
+        (4, 0x10C30C30C30C30C3), (2, 0x1249249249249249),
+    ):  # fmt: skip
+        values = (values | values << np.uint64(shift)) & np.uint64(mask)
+    return values

@@ -22,7 +22,7 @@ from typing import IO, Annotated, Any, Self
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Int64
 from msgspec import Meta
 from numpy.lib.format import write_array_header_1_0
 from numpy.typing import NDArray
@@ -30,7 +30,7 @@ from torch import Tensor
 
 from splatseg.core import Gaussians
 from splatseg.core.boundary import boundary
-from splatseg.core.chunks import Chunks
+from splatseg.core.chunks import Chunks, morton_order
 from splatseg.core.coarser import RUN, coarser
 from splatseg.core.gaussians import LOW_PASS
 from splatseg.core.options import Natural
@@ -52,18 +52,11 @@ CHUNK_ROWS = 1 << 14
 """Gaussians of a chunk: 2.5 MB of degree 2. Smaller ones fit a view closer and are more to look
 at."""
 
-_LARGE = 1 / 64
-"""Share of the Gaussians that stand apart because they are the largest: a chunk is seen from as far
-as its largest Gaussian."""
-
 _MAX_HALF = 65504.0
 """Largest number of half precision."""
 
 _BLOCK = 1 << 18
 """Rows of a source that are read at once."""
-
-_BITS = 21
-"""Of each coordinate on the Morton curve: three fit into 64."""
 
 Rows = Callable[[int, int], Gaussians]
 """Reads the Gaussians from one row to before another."""
@@ -343,55 +336,6 @@ class ChunkWriter:
         dtype = self._shapes[name][0]
         file.seek(offset + row * int(np.prod(values.shape[1:])) * dtype.itemsize)
         file.write(np.ascontiguousarray(values, dtype).tobytes())
-
-
-@boundary
-def morton_order(
-    means: Float[Tensor, "n 3"], largest: Float[Tensor, "n"]
-) -> tuple[Int64[Tensor, "n"], int]:
-    """The rows in the order in which chunks have them, and how many of the first stand apart.
-
-    Coordinates have 21 bits each in the box around all centres. Equal ones keep their order.
-
-    Args:
-        means: Centres.
-        largest: Largest standard deviation of each.
-
-    Returns:
-        The rows, those of the largest Gaussians first, and how many those are.
-
-    Example:
-        >>> corners = torch.tensor([[0.0, 0, 0], [1, 1, 1], [0, 0, 1], [0.1, 0, 0]])
-        >>> morton_order(corners, torch.ones(4))
-        (tensor([0, 3, 2, 1]), 0)
-    """
-    count = len(means)
-    codes = np.zeros(count, np.uint64)
-    if count:
-        low, high = (corner.double().numpy() for corner in torch.aminmax(means, dim=0))
-        scale = (2**_BITS - 1) / np.maximum(high - low, 1e-300)
-        for start in range(0, count, _BLOCK):
-            part = slice(start, start + _BLOCK)
-            cells = (means[part].double().numpy() - low) * scale
-            for axis in range(3):
-                codes[part] |= _spread(cells[:, axis].astype(np.uint64)) << np.uint64(axis)
-    apart = int(count * _LARGE)
-    if apart:
-        limit = float(largest.kthvalue(count - apart).values)
-        small = (largest > limit).logical_not().numpy()
-        apart = count - int(small.sum())
-        codes |= small.astype(np.uint64) << np.uint64(63)
-    return torch.from_numpy(np.argsort(codes, kind="stable")), apart
-
-
-def _spread(values: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """The 21 bits of numbers with two zeros between each two of them."""
-    for shift, mask in (
-        (32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F),
-        (4, 0x10C30C30C30C30C3), (2, 0x1249249249249249),
-    ):  # fmt: skip
-        values = (values | values << np.uint64(shift)) & np.uint64(mask)
-    return values
 
 
 @boundary

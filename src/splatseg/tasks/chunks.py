@@ -52,6 +52,10 @@ class ChunkOptions:
     """The other way: SCENE is in chunks, and NEW has its Gaussians in one PLY file, in the order of
     the chunks."""
 
+    def __post_init__(self) -> None:
+        if self.whole and (self.levels or self.harmonics != "float32"):
+            raise InputError("whole: takes no `harmonics` and no `levels`.")
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChunkedScene:
