@@ -62,20 +62,16 @@ class Rates:
     sh_degree_interval: float
     """Progress between one degree of the spherical harmonics and the next."""
 
-    average_from: float
-    """Progress from which on the parameters are averaged, see `TailAverage`; infinity for none."""
-
 
 RATES = {
     "fast": Rates(
         position=8e-4,
         position_end=8e-6,
         scale=1e-2,
-        final=1.0,
+        final=0.2,
         quarter_until=0.02,
         half_until=0.07,
         sh_degree_interval=0.1,
-        average_from=0.75,
     ),
     "published": Rates(
         position=1.6e-4,
@@ -85,14 +81,7 @@ RATES = {
         quarter_until=0.0,
         half_until=0.0,
         sh_degree_interval=1 / 30,
-        average_from=math.inf,
     ),
-}
-
-# Refinements are short and are not averaged, so their rates decay.
-REFINEMENT_RATES = {
-    "fast": replace(RATES["fast"], final=0.2),
-    "published": RATES["published"],
 }
 
 Background = str | tuple[float, float, float]
@@ -187,8 +176,7 @@ class FitOptions:
 
     rates: Literal["fast", "published"] = "fast"
     """Learning rates and coarse-to-fine stages. fast: measured best on fits of minutes, the first
-    7 % of which see downsampled photographs, and the last quarter of which is averaged.
-    published: those of 3DGS, for 30 000 steps."""
+    7 % of which see downsampled photographs. published: those of 3DGS, for 30 000 steps."""
 
     opacity_penalty: NonNegative = 0.01
     """Weight of the mean opacity in the loss, a regulariser: unneeded opacities decay."""

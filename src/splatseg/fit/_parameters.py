@@ -11,14 +11,7 @@ from splatseg import _native
 from splatseg.core import Camera, Gaussians
 from splatseg.core.gaussians import exponential, sigmoid
 from splatseg.core.rigid import rotation_from_quaternion
-from splatseg.fit._options import (
-    COLOUR_RATE,
-    OPACITY_RATE,
-    RATES,
-    ROTATION_RATE,
-    FitOptions,
-    Rates,
-)
+from splatseg.fit._options import COLOUR_RATE, OPACITY_RATE, RATES, ROTATION_RATE, FitOptions
 
 # 2 ln 255: beyond this Mahalanobis distance squared even an opaque Gaussian's alpha is < 1/255.
 _MAX_SIGMAS = 3.34
@@ -229,8 +222,9 @@ class StepRates:
     """Spherical harmonics of degrees 1 to 3."""
 
 
-def rates_at(progress: float, *, rates: Rates, options: FitOptions, extent: float) -> StepRates:
+def rates_at(progress: float, *, options: FitOptions, extent: float) -> StepRates:
     """Learning rates at a progress: each decays exponentially from its start to its end."""
+    rates = RATES[options.rates]
     start, end = rates.position, rates.position_end
     left = rates.final**progress
     means = 0.0 if options.strategy == "fixed" else extent * start * (end / start) ** progress
