@@ -17,8 +17,8 @@ class Command(Printing):
     """Write a scene in chunks: Gaussians that commands stream from the disk.
 
     A scene larger than memory is a folder of chunks, which lie near each other and of which a view
-    reads those before it. render, segment (uplift, features, associate), select, edit and export
-    stream it within --memory; other commands refuse it. Rows are put into another order, layers and
+    reads those before it. render, segment (uplift, associate), select, edit and export stream
+    it within --memory; other commands refuse it. Rows are put into another order, layers and
     the scene's own evidence come along, and SCENE stays as it is.
 
     SCENE is a scene folder or a binary PLY file, which may be larger than memory; a PLY file gets

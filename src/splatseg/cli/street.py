@@ -10,7 +10,7 @@ import tyro
 
 from splatseg.cli._shared import Backend, Data, Overwrite, Printing, print_result, typed
 from splatseg.errors import InputError
-from splatseg.io.scene import scene_field_path
+from splatseg.io.scene_fields import scene_field_path
 from splatseg.report.words import counted
 from splatseg.street.build import DnmpOptions
 from splatseg.street.field import VERTEX_WORDS

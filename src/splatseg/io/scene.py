@@ -23,7 +23,6 @@ import os
 import re
 import shutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -102,7 +101,8 @@ class _SceneFile:
     provenance: dict[str, Any] | None = None
 
 
-_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]{0,199}")
+NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]{0,199}")
+"""What layers and fields may be called."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -309,7 +309,7 @@ def _gaussians(root: Path, memory: int | None, level: int) -> Gaussians:
 def scene_layer_names(root: Path | str) -> tuple[str, ...]:
     """Names of the layers of a scene folder, sorted. Other files in their folder are none."""
     names = (path.stem for path in (Path(root) / "layers").glob("*.npz"))
-    return tuple(sorted(name for name in names if _NAME.fullmatch(name)))
+    return tuple(sorted(name for name in names if NAME.fullmatch(name)))
 
 
 @boundary
@@ -355,7 +355,7 @@ def check_name(what: str, name: str) -> None:
     """Raise `InputError` unless `name` can be that of a layer or of evidence."""
     wanted = "a name of letters, digits and _ . + - that does not start with a point or a sign, "
     wanted += f"got {name!r}"
-    expect(_NAME.fullmatch(name), what, wanted, error=InputError)
+    expect(NAME.fullmatch(name), what, wanted, error=InputError)
 
 
 def _check_layer(name: str, layer: Layer, count: int) -> None:
@@ -462,94 +462,3 @@ def _source(
     there = [candidate for candidate in candidates if is_folder(candidate)]
     with_photographs = [p for p in there if not photographs or is_file(p / photographs[0])]
     return next(iter([*with_photographs, *there, candidates[1]]))
-
-
-# Fields, which are no Gaussians: a file, or the folder of a drive in blocks. What is in them is the
-# business of who makes them (`splatseg.street`); here is where they are, and how they are called.
-
-FOLDER = "fields"
-SUFFIX = ".safetensors"
-DRIVE_FILE = "drive.json"
-"""What makes a folder that of a drive in blocks."""
-
-
-@boundary
-def scene_field_names(root: Path) -> tuple[str, ...]:
-    """Names of the fields of a scene folder, sorted. Other files in their folder are none."""
-    folder = root / FOLDER
-    files = {p.name.removesuffix(SUFFIX) for p in folder.glob(f"*{SUFFIX}") if p.is_file()}
-    drives = {path.parent.name for path in folder.glob(f"*/{DRIVE_FILE}")}
-    return tuple(sorted(name for name in files | drives if _NAME.fullmatch(name)))
-
-
-@boundary
-def scene_field_path(root: Path, name: str) -> Path:
-    """The file of a field that a scene has, or the folder of a drive in blocks.
-
-    Raises:
-        InputError: If it has none of this name.
-    """
-    names = scene_field_names(root)
-    if name not in names:
-        known = ", ".join(names) if names else "it has none; `splatseg street` makes one"
-        raise InputError(f"field: expected one of {root} ({known}), got {name!r:.80}.")
-    file = root / FOLDER / f"{name}{SUFFIX}"
-    return file if file.is_file() else root / FOLDER / name
-
-
-@boundary
-def new_field_file(root: Path, name: str) -> Path:
-    """Where the file of a field is to be written; its folder is made.
-
-    Raises:
-        InputError: If the name cannot be a file's, or a link leads out of the scene.
-        OutputError: If the folder cannot be made.
-    """
-    check_name("field", name)
-    return scene_path(root, FOLDER, f"{name}{SUFFIX}")
-
-
-@boundary
-def new_field_folder(root: Path, name: str) -> Path:
-    """The folder of a field in blocks, which is made where it is not there.
-
-    Raises:
-        InputError: If the name cannot be a folder's, or a link leads out of the scene.
-        OutputError: If the folder cannot be made.
-    """
-    check_name("field", name)
-    return scene_path(root, FOLDER, name, DRIVE_FILE).parent
-
-
-@boundary
-def remove_field_file(root: Path, name: str) -> None:
-    """Remove a field that is a file, where there is one.
-
-    Raises:
-        InputError: If a link leads out of the scene.
-        OutputError: If it cannot be removed.
-    """
-    path = new_field_file(root, name)
-    with named_write_failures(path):
-        path.unlink(missing_ok=True)
-
-
-@boundary
-def remove_field_folder(root: Path, name: str) -> None:
-    """Remove a field in blocks, where there is one; what else its folder holds stays.
-
-    Raises:
-        InputError: If a link leads out of the scene.
-        OutputError: If it cannot be removed.
-    """
-    check_name("field", name)
-    if not (root / FOLDER / name).is_dir():
-        return
-    folder = new_field_folder(root, name)
-    with named_write_failures(folder):
-        # The table first: without it the rest is no field.
-        (folder / DRIVE_FILE).unlink(missing_ok=True)
-        for block in folder.glob(f"[0-9]*{SUFFIX}"):
-            block.unlink()
-        with suppress(OSError):  # it is not empty
-            folder.rmdir()

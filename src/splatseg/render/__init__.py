@@ -15,9 +15,9 @@ from splatseg.render._values import SparseBackProjected as SparseBackProjected
 from splatseg.render._values import SparseImage as SparseImage
 from splatseg.render._values import SparseSignal as SparseSignal
 from splatseg.render._values import StrongestChannels as StrongestChannels
+from splatseg.render.once import back_project as back_project
+from splatseg.render.once import contributors as contributors
+from splatseg.render.once import render as render
+from splatseg.render.once import weights as weights
 from splatseg.render.prepared import PreparedView as PreparedView
-from splatseg.render.prepared import back_project as back_project
-from splatseg.render.prepared import contributors as contributors
 from splatseg.render.prepared import prepare as prepare
-from splatseg.render.prepared import render as render
-from splatseg.render.prepared import weights as weights

@@ -26,7 +26,7 @@ from splatseg.io.json_files import (
     read_json,
     write_json,
 )
-from splatseg.io.scene import DRIVE_FILE
+from splatseg.io.scene_fields import DRIVE_FILE
 from splatseg.io.schema import read_structured, structured
 from splatseg.io.tensors import read_safetensors, read_safetensors_words, write_tensors
 from splatseg.street.block_field import DriveField, joined_layers

@@ -27,14 +27,8 @@ from splatseg.io.evidence import Evidence, evidence_names, open_evidence
 from splatseg.io.images import DEFAULT_LONGEST, image_size
 from splatseg.io.layers import load_layer
 from splatseg.io.limits import memory_to_use
-from splatseg.io.scene import (
-    DRIVE_FILE,
-    load_scene,
-    load_scene_layer,
-    scene_field_names,
-    scene_field_path,
-    scene_layer_names,
-)
+from splatseg.io.scene import load_scene, load_scene_layer, scene_layer_names
+from splatseg.io.scene_fields import DRIVE_FILE, scene_field_names, scene_field_path
 from splatseg.io.scene_folder import (
     CHECKPOINT_FILE,
     is_scene,

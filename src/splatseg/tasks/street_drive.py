@@ -16,7 +16,7 @@ from splatseg.errors import InputError, brief
 from splatseg.io.atomic import path_inside
 from splatseg.io.digests import camera_numbers, digest, file_mark
 from splatseg.io.evidence import DepthEvidence, LabelEvidence
-from splatseg.io.scene import (
+from splatseg.io.scene_fields import (
     DRIVE_FILE,
     FOLDER,
     new_field_folder,

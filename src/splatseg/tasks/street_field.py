@@ -15,7 +15,8 @@ from splatseg.core.boundary import boundary
 from splatseg.errors import InputError
 from splatseg.io.captures import read_capture
 from splatseg.io.evidence import Evidence
-from splatseg.io.scene import load_scene, new_field_file, remove_field_folder, save_scene
+from splatseg.io.scene import load_scene, save_scene
+from splatseg.io.scene_fields import new_field_file, remove_field_folder
 from splatseg.io.scene_folder import is_scene, scene_lock
 from splatseg.render import BackendName
 from splatseg.street.build import (

@@ -7,7 +7,7 @@ from splatseg.core import PointLabels, Renderable, Scan, Scene
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError
 from splatseg.io.scans import Scans
-from splatseg.io.scene import FOLDER, scene_field_names, scene_field_path
+from splatseg.io.scene_fields import FOLDER, scene_field_names, scene_field_path
 from splatseg.io.scene_folder import work_on_scene
 from splatseg.render import BackendName
 from splatseg.report.maps import LabelledPoints

@@ -32,7 +32,8 @@ from splatseg.evaluate.photographs import MaskUse
 from splatseg.io.atomic import atomic_file, check_utf8, check_writable, is_vacant, sweep
 from splatseg.io.evidence import Evidence, evidence_names, find_evidence, open_evidence
 from splatseg.io.json_files import write_json
-from splatseg.io.scene import load_scene_layer, scene_field_path, scene_layer_names
+from splatseg.io.scene import load_scene_layer, scene_layer_names
+from splatseg.io.scene_fields import scene_field_path
 from splatseg.io.scene_folder import check_unlocked, is_scene, is_unfinished
 from splatseg.lift import GaussianField
 from splatseg.lift.affinity import KIND

@@ -19,15 +19,17 @@ from splatseg.io.images import load_image
 from splatseg.io.scene import (
     load_scene,
     load_scene_layer,
+    save_scene,
+    save_scene_layer,
+    scene_layer_names,
+)
+from splatseg.io.scene_fields import (
     new_field_file,
     new_field_folder,
     remove_field_file,
     remove_field_folder,
-    save_scene,
-    save_scene_layer,
     scene_field_names,
     scene_field_path,
-    scene_layer_names,
 )
 from splatseg.io.scene_folder import is_scene
 

@@ -13,7 +13,7 @@ from PIL import Image
 from splatseg.core import Renderable, Scene
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.io.scans import read_scans
-from splatseg.io.scene import scene_field_names
+from splatseg.io.scene_fields import scene_field_names
 from splatseg.street.block_field import DriveField
 from splatseg.street.blocks import DriveBlockOptions, distances
 from splatseg.street.build import DnmpOptions

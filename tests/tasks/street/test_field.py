@@ -12,7 +12,7 @@ from splatseg.core import Gaussians, ScanSource, Scene
 from splatseg.errors import InputError
 from splatseg.io.evidence import create_evidence
 from splatseg.io.scans import read_scans
-from splatseg.io.scene import scene_field_names
+from splatseg.io.scene_fields import scene_field_names
 from splatseg.street.build import DnmpOptions, visible_shares
 from splatseg.tasks import (
     EvaluationOptions,
