@@ -172,6 +172,21 @@ def test_what_is_said(scene, chunked, tmp_path, capsys) -> None:
     assert load_scene(tmp_path / "again", memory=1).gaussians.sh.itemsize == 2
 
 
+def test_exports_of_a_layer_are_those_of_the_scene_in_memory(chunked, tmp_path) -> None:
+    whole = tmp_path / "whole"
+    assert main(["chunks", str(chunked), "--whole", "-o", str(whole)]) == 0
+    words = "segment SCENE --method uplift --evidence labels_semantic --layer made --export"
+    made: list[dict[Path, bytes]] = []
+    for root in (chunked, whole):
+        assert main(line(words, SCENE=root)) == 0
+        folder = root / "exports" / "made"
+        files = [path for path in folder.rglob("*") if path.is_file()]
+        own = str(root).encode()
+        made.append({p.relative_to(folder): p.read_bytes().replace(own, b"") for p in files})
+    assert Path("labelled.ply") in made[0]
+    assert made[0] == made[1]
+
+
 def test_a_missing_chunk_file_is_one_error(chunked, tmp_path, capsys) -> None:
     shutil.copytree(chunked, tmp_path / "broken")
     (tmp_path / "broken" / "gaussians" / "scales.npy").unlink()
