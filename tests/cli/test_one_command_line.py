@@ -17,11 +17,11 @@ from splatseg.io.scene import load_scene_layer
 
 CLI = Path(cli.__file__).parent
 MAKE = {
-    "attach", "demo", "edit", "evaluate", "export", "fit", "import", "query", "render",
+    "attach", "chunks", "demo", "edit", "evaluate", "export", "fit", "import", "query", "render",
     "see", "segment", "select", "sharpen", "street", "view",
 }  # fmt: skip
 TELL = {"doctor", "info"}
-OWN_HELP = {"frames": ["fit"], "seed": ["demo"]}
+OWN_HELP = {"data CAPTURE": ["chunks"], "frames": ["fit"], "seed": ["demo"]}
 
 
 def help_of(page: str, flag: str) -> str | None:
