@@ -34,10 +34,10 @@ from splatseg.errors import InputError
 if TYPE_CHECKING:
     from splatseg.core.gaussians import Gaussians
 
-_REACH = 3.34
+REACH = 3.34
 """Standard deviations that alpha >= 1/255 reaches at most: sqrt(2 ln 255) = 3.33."""
 
-_MARGIN = 0.3
+MARGIN = 0.3
 """Share of the field of view by which directions may lie beside it before they are clamped."""
 
 _ROUNDING = 1.0
@@ -118,12 +118,12 @@ class Chunks:
         boxes = torch.stack([corners[of[:, axis], :, axis] for axis in range(3)], dim=2)
         pose = camera.cam_from_world.detach().cpu().double()
         x, y, z = (boxes @ pose[:3, :3].T + pose[:3, 3]).unbind(dim=2)
-        pad = _REACH * (low_pass**0.5 + 0.01) + _ROUNDING
+        pad = REACH * (low_pass**0.5 + 0.01) + _ROUNDING
         right, below = camera.width - camera.cx, camera.height - camera.cy
-        a = max(camera.cx, right) / camera.fx + _MARGIN * camera.width / (2 * camera.fx)
-        b = max(camera.cy, below) / camera.fy + _MARGIN * camera.height / (2 * camera.fy)
+        a = max(camera.cx, right) / camera.fx + MARGIN * camera.width / (2 * camera.fx)
+        b = max(camera.cy, below) / camera.fy + MARGIN * camera.height / (2 * camera.fy)
         focal = max(camera.fx * (1 + a * a) ** 0.5, camera.fy * (1 + b * b) ** 0.5)
-        reach = _REACH * focal * self.largest.double() * (1 + 1e-5)
+        reach = REACH * focal * self.largest.double() * (1 + 1e-5)
         edges = (
             camera.fx * x - (right + pad) * z,
             -camera.fx * x - (camera.cx + pad) * z,

@@ -9,16 +9,13 @@ from torch import Tensor
 
 from splatseg import _native
 from splatseg.core import Camera, Gaussians
+from splatseg.core.chunks import MARGIN, REACH
 from splatseg.core.gaussians import exponential, sigmoid
 from splatseg.core.rigid import rotation_from_quaternion
 from splatseg.fit._options import COLOUR_RATE, OPACITY_RATE, RATES, ROTATION_RATE, FitOptions
 
-# 2 ln 255: beyond this Mahalanobis distance squared even an opaque Gaussian's alpha is < 1/255.
-_MAX_SIGMAS = 3.34
 # More than the square root of the low-pass variance of 0.3 square pixels.
 _LOW_PASS_SIGMA = 0.55
-# The Jacobian is taken at most this far outside the image, in half image sizes.
-_FRUSTUM_MARGIN = 0.3
 
 _MIN_SCALE = 1e-12
 _OPACITY_MARGIN = 1e-6
@@ -155,11 +152,9 @@ def rows_in_view_torch(
         (x * inverse, camera.fx, camera.cx, camera.width),
         (y * inverse, camera.fy, camera.cy, camera.height),
     ):
-        margin = _FRUSTUM_MARGIN * 0.5 * size / focal
+        margin = MARGIN * 0.5 * size / focal
         tangent = along.clamp(-centre / focal - margin, (size - centre) / focal + margin)
-        radius = _MAX_SIGMAS * (
-            max_scales * focal * (1 + tangent * tangent).sqrt() + _LOW_PASS_SIGMA
-        )
+        radius = REACH * (max_scales * focal * (1 + tangent * tangent).sqrt() + _LOW_PASS_SIGMA)
         at = along * focal + centre
         inside &= (at + radius >= 0) & (at - radius <= size)
     return inside.nonzero().squeeze(1)

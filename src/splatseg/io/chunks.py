@@ -16,6 +16,7 @@ stretch of each: nothing is unpacked (docs/decisions/files.md has what that was 
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from io import FileIO
 from itertools import pairwise
 from pathlib import Path
 from typing import IO, Annotated, Any, Self
@@ -209,7 +210,7 @@ class _Files:
             return values
 
     @contextmanager
-    def _opened(self, name: str) -> Generator[tuple[IO[bytes], ArrayHeader]]:
+    def _opened(self, name: str) -> Generator[tuple[FileIO, ArrayHeader]]:
         path = self._folder / f"{name}.npy"
         with reading(path, "an array of NumPy"), path.open("rb", buffering=0) as file:
             yield file, read_header(file, size=path.stat().st_size, where=path)
@@ -232,12 +233,12 @@ class _Files:
             at += end - first
 
 
-def _read_rows(file: IO[bytes], header: ArrayHeader, first: int, into: NDArray[Any]) -> None:
+def _read_rows(file: FileIO, header: ArrayHeader, first: int, into: NDArray[Any]) -> None:
     """Rows of numbers of the header's type from one on; `into` is contiguous and says how many."""
     data, at = into.reshape(-1).view(np.uint8).data, 0
     file.seek(header.offset + first * int(np.prod(into.shape[1:])) * header.dtype.itemsize)
     while at < len(data):
-        step = file.readinto(data[at:])  # type: ignore[attr-defined]
+        step = file.readinto(data[at:])
         if not step:
             raise EOFError(f"it ends after {at} of {len(data)} bytes")
         at += step

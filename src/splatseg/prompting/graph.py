@@ -34,8 +34,7 @@ Boykov and Jolly, Interactive Graph Cuts for Optimal Boundary & Region Segmentat
 Kolmogorov and Zabih, What Energy Functions Can Be Minimized via Graph Cuts? (2004), theorem 4.1.
 """
 
-from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -47,9 +46,7 @@ from torch import Tensor
 from splatseg._check import check_shape, check_values
 from splatseg.core import Gaussians, Selection
 from splatseg.core.boundary import boundary
-from splatseg.core.chunks import Chunks
 from splatseg.core.options import Count
-from splatseg.errors import InputError
 from splatseg.lift.minimum_cut import minimum_cut
 from splatseg.lift.neighbour_graph import (
     NodeAttributes,
@@ -97,12 +94,6 @@ _BAND = 2
 _UNSURE = 0.25
 """Gaussians whose membership and its complement are both at least this are decided anew where they
 hang together with the band."""
-
-_MARGIN = 0.25
-"""Of what a chunk is usually wide, by which neighbours are looked for around a selection."""
-
-_GRAPH_BYTES = 1060
-"""Of each Gaussian while its neighbours are found."""
 
 _MAX_BAND = 20_000
 """Most Gaussians that are decided anew, those nearest to the border over the graph first."""
@@ -206,53 +197,6 @@ def build_graph(gaussians: Gaussians, *, neighbours: Count = _NEIGHBOURS) -> Nei
         touching=touching(gaussians, low, high),
         mean_degree=degree if degree > 0 else 1.0,
     )
-
-
-def graph_near(gaussians: Gaussians, chunks: Chunks, mask: Bool[Tensor, "n"]) -> NeighbourGraph:
-    """The neighbours of what is near some Gaussians on the disk; others have none.
-
-    Near is what lies in the box around those of a chunk, with a margin of a quarter of what a chunk
-    is usually wide: some ten times as far as nearest neighbours are.
-
-    Args:
-        gaussians: Gaussians on the disk.
-        chunks: Where they are.
-        mask: The Gaussians.
-
-    Raises:
-        InputError: If they are more than fit in the memory.
-    """
-    from scipy.sparse import csr_matrix
-
-    margin = _MARGIN * (chunks.high - chunks.low).median(dim=1).values.median()
-    boxes: list[tuple[Tensor, Tensor]] = []
-    chosen = torch.zeros(len(chunks), dtype=torch.bool)
-    for first, end in pairwise(chunks.starts.tolist()):
-        if bool((mine := mask[first:end]).any()):
-            means = gaussians.means[first:end][mine]
-            boxes.append((means.amin(dim=0) - margin, means.amax(dim=0) + margin))
-            chosen |= chunks.around(*boxes[-1])
-    rows = chunks.rows(chosen)
-    near = torch.zeros(len(rows), dtype=torch.bool)
-    means = gaussians.means[rows]
-    for low, high in boxes:
-        near |= ((means >= low) & (means <= high)).all(dim=1)
-    needed = _GRAPH_BYTES * int(near.sum())
-    if needed > chunks.memory:
-        raise InputError(
-            f"memory: neighbours of what is around the selection take about {needed / 1e9:.1f} GB, "
-            f"more than the {chunks.memory / 1e9:.1f} GB that were allowed; allow more, or select "
-            "with post_processing none."
-        )
-    rows = rows[near]
-    local = build_graph(gaussians[rows])
-    matrix, count = local.strengths, len(gaussians)
-    sizes = np.zeros(count, np.int32)
-    sizes[rows.numpy()] = np.diff(matrix.indptr)
-    ends = np.concatenate(([0], np.cumsum(sizes, dtype=np.int32)), dtype=np.int32)
-    indices = rows.int().numpy()[matrix.indices]
-    strengths: Any = csr_matrix((matrix.data, indices, ends), shape=(count, count))
-    return replace(local, strengths=strengths)
 
 
 def holes(graph: NeighbourGraph, selection: Selection) -> Selection:

@@ -41,10 +41,10 @@ from splatseg.prompting.graph import (
     build_graph,
     complete_membership,
     graph_cut,
-    graph_near,
     holes,
     specks,
 )
+from splatseg.prompting.graph_near import graph_near
 from splatseg.prompting.next_click import NextClick
 from splatseg.prompting.seen import ViewCache, VisiblePrompt
 
