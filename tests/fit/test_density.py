@@ -5,17 +5,23 @@ import math
 import pytest
 import torch
 
-from splatseg.core import Camera
+from splatseg.core import Camera, Gaussians
+from splatseg.core.sh import SH_C0
 from splatseg.fit import FitOptions
 from splatseg.fit._density import (
     DefaultStrategy,
+    MCMCStrategy,
     ScreenStatistics,
     densified,
     relocated,
     shared_shape,
+    shown_pixels,
     with_reset_opacities,
 )
-from splatseg.fit._parameters import Parameters
+from splatseg.fit._options import DEAD_OPACITY
+from splatseg.fit._parameters import Parameters, gradients_of
+from splatseg.fit._step import l1_dssim
+from splatseg.render import default_options, get_backend
 
 
 def _parameters(opacities: list[float]) -> Parameters:
@@ -41,6 +47,7 @@ def _relocated(
         parameters,
         _ones(parameters),
         _ones(parameters),
+        dead=parameters.logits.sigmoid().squeeze(1) <= DEAD_OPACITY,
         count=count,
         generator=torch.Generator().manual_seed(seed),
     )
@@ -121,6 +128,146 @@ def test_same_seed_same_places() -> None:
     one, same, other = (_relocated(before, count=37, seed=s)[0].means for s in (4, 4, 5))
     assert torch.equal(one, same)
     assert not torch.equal(one, other)
+
+
+DRAWN = default_options("cpu")
+CAMERA = Camera(
+    width=40, height=30, fx=40.0, fy=40.0, cx=20, cy=15, cam_from_world=torch.eye(4).double()
+)
+
+
+def _gradients(colour: list[float], opacity: list[float]) -> Gaussians:
+    """Gradients of the loss: of the red of degree 0, and of the opacity."""
+    count = len(colour)
+    sh = torch.zeros(count, 4, 3)
+    sh[:, 0, 0] = torch.tensor(colour)
+    return Gaussians(
+        means=torch.zeros(count, 3),
+        rotations=torch.zeros(count, 4),
+        scales=torch.zeros(count, 3),
+        opacities=torch.tensor(opacity),
+        sh=sh,
+    )
+
+
+def _strategy(rates="fast", start=4) -> MCMCStrategy:
+    options = FitOptions(
+        minutes=None,
+        steps=1000,
+        rates=rates,
+        max_gaussians=start,
+        densify_from=1,
+        densify_every=10,
+        densify_until=1.0,
+    )
+    return MCMCStrategy(options, start=start, views=5)
+
+
+def _show(strategy: MCMCStrategy, rows: list[int], *, steps: int, parameters: Parameters) -> None:
+    """A step that shows a pixel of each of these rows."""
+    strategy.add_view(
+        torch.tensor(rows),
+        _gradients([SH_C0 / (3 * 40 * 30)] * len(rows), [0.0] * len(rows)),
+        screen=None,
+        camera=CAMERA,
+        parameters=parameters,
+        steps=steps,
+    )
+
+
+def test_pixels_shown_are_the_sum_of_weights() -> None:
+    """A ball before a grey wall, over which the loss has one sign; a black one; a hidden one."""
+    count = 4
+    gaussians = Gaussians(
+        means=torch.tensor([[0.0, 0, 4], [1.0, 0, 4], [0.0, 0, 9], [0.0, 0, 6]]),
+        rotations=torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
+        scales=torch.tensor([[0.1], [0.1], [0.05], [99.0]]).expand(-1, 3).contiguous(),
+        opacities=torch.tensor([0.6, 0.5, 0.9, 0.9999]),
+        sh=torch.tensor([[1.0], [-3.0], [1.0], [0.0]])[..., None].expand(-1, -1, 3).contiguous(),
+    )
+    leaves = gaussians.means, gaussians.rotations, gaussians.scales, gaussians.opacities
+    for tensor in (*leaves, gaussians.sh):
+        tensor.requires_grad_()
+    rendered = get_backend("cpu").render(gaussians, CAMERA, None, options=DRAWN)
+    loss = l1_dssim(rendered.image, torch.zeros(30, 40, 3) - 1.0, dssim_weight=0.0)
+    rendered.image.backward(loss.gradient)
+    gradients = gradients_of(gaussians)
+    shown = shown_pixels(gradients, opacities=gaussians.opacities.detach(), pixels=1200)
+    signal = torch.eye(count)
+    with torch.no_grad():
+        weights = (
+            get_backend("cpu")
+            .render(gaussians, CAMERA, signal, options=DRAWN)
+            .image.sum(dim=(0, 1))
+        )
+    assert float(weights[0]) > 3
+    torch.testing.assert_close(shown[[0, 3]], weights[[0, 3]], rtol=1e-4, atol=1e-4)
+    # Black over grey, which is as opaque as can be (0.99): half its weight.
+    assert float(gradients.sh[1].abs().max()) == 0.0
+    assert float(shown[1]) == pytest.approx(0.495 * float(weights[1]), rel=0.01)
+    assert float(shown[2]) < 0.05
+
+
+def test_what_no_view_has_shown_in_two_epochs_is_relocated() -> None:
+    parameters = _parameters([0.5, 0.6, 0.7, 0.8])
+    state = (parameters, _ones(parameters), _ones(parameters))
+    strategy, generator = _strategy(), torch.Generator().manual_seed(0)
+    for steps, rows in ((2, [2]), (11, [0, 1]), (17, [0])):
+        _show(strategy, rows, steps=steps, parameters=parameters)
+        assert strategy.after_step(state, steps=9, progress=0.1, generator=generator) is state
+    # Two epochs of five views: 3 was never shown, 2 in step 2, 1 in step 11, 0 in step 17.
+    after = strategy.after_step(state, steps=20, progress=0.1, generator=generator)
+    moved = (after[0].means != parameters.means).any(dim=1)
+    assert moved.tolist() == [False, False, True, True]
+    assert all(float(row) in parameters.means[:2, 0].tolist() for row in after[0].means[2:, 0])
+    # They are as new as if they had been shown now.
+    assert strategy.state()["last_shown"].tolist() == [17, 11, 20, 20]
+
+
+def test_a_tenth_of_a_pixel_is_shown() -> None:
+    parameters = _parameters([0.5, 0.5, 0.5, 0.5])
+    strategy = _strategy()
+    unit = SH_C0 / (3 * 40 * 30)
+    strategy.add_view(
+        torch.tensor([3, 2, 1, 0]),
+        _gradients([0.101 * unit, -0.099 * unit, 0.0, 0.0], [0, 0, 0.21 / 1200, -0.19 / 1200]),
+        screen=None,
+        camera=CAMERA,
+        parameters=parameters,
+        steps=7,
+    )
+    # The pull of an opacity of a half counts half.
+    assert strategy.state()["last_shown"].tolist() == [0, 7, 0, 7]
+
+
+def test_published_rates_relocate_the_transparent_alone() -> None:
+    parameters = _parameters([0.5, 0.001, 0.7, 0.8])
+    state = (parameters, _ones(parameters), _ones(parameters))
+    after = _strategy("published").after_step(
+        state, steps=500, progress=0.5, generator=torch.Generator().manual_seed(0)
+    )
+    moved = (after[0].means != parameters.means).any(dim=1)
+    assert moved.tolist() == [False, True, False, False]
+
+
+def test_the_added_are_as_if_shown_now_and_a_restored_one_goes_on() -> None:
+    parameters = _parameters([0.5] * 4)
+    strategy = MCMCStrategy(
+        FitOptions(minutes=None, steps=100, max_gaussians=6, densify_from=1, densify_every=10),
+        start=4,
+        views=50,
+    )
+    _show(strategy, [1], steps=3, parameters=parameters)
+    after = strategy.after_step(
+        (parameters, _ones(parameters), _ones(parameters)),
+        steps=10,
+        progress=0.55,
+        generator=torch.Generator().manual_seed(0),
+    )
+    assert len(after[0]) == 6
+    other = _strategy()
+    other.restore(strategy.state())
+    assert other.state()["last_shown"].tolist() == [0, 3, 0, 0, 10, 10]
 
 
 # Classic densification: each rule on a scene of a few Gaussians.
@@ -315,7 +462,14 @@ def test_statistics_go_on_after_a_restore():
     camera = Camera(
         width=2, height=2, fx=1.0, fy=1.0, cx=1, cy=1, cam_from_world=torch.eye(4).double()
     )
-    one.add_view(torch.tensor([1]), torch.ones(1, 2), camera=camera, parameters=state[0])
+    one.add_view(
+        torch.tensor([1]),
+        _gradients([0.0], [0.0]),
+        screen=torch.ones(1, 2),
+        camera=camera,
+        parameters=state[0],
+        steps=42,
+    )
     other = DefaultStrategy(options, start=2, extent=EXTENT, device=torch.device("cpu"))
     other.restore(one.state())
     assert other.state().keys() == {"gradients", "views", "radii", "resets"}

@@ -14,7 +14,7 @@ from splatseg.core.sh import SH_C0
 from splatseg.errors import InputError, MissingFileError, RangeError
 from splatseg.evaluate import evaluate_photographs
 from splatseg.fit import FitOptions, FitProgress, FitResult, fit
-from splatseg.fit._options import COLOUR_RATE
+from splatseg.fit._options import COLOUR_RATE, RATES, REFINEMENT_RATES
 from splatseg.fit._parameters import count_at, degree_at, rates_at, reduction_at
 from splatseg.lift import GaussianField
 from splatseg.render import render
@@ -333,11 +333,16 @@ SCHEDULE = FitOptions(sh_degree=2, max_gaussians=1000)
 
 @pytest.mark.parametrize(
     ("rates", "means", "scales", "final"),
-    [("fast", (8e-4, 8e-6), 1e-2, 0.2), ("published", (1.6e-4, 1.6e-6), 5e-3, 1.0)],
+    [
+        (RATES["fast"], (8e-4, 8e-6), 1e-2, 1.0),
+        (RATES["published"], (1.6e-4, 1.6e-6), 5e-3, 1.0),
+        (REFINEMENT_RATES["fast"], (8e-4, 8e-6), 1e-2, 0.2),
+    ],
 )
 def test_rates_fall_exponentially(rates, means, scales, final) -> None:
-    options = FitOptions(rates=rates)
-    begin, halfway, end = (rates_at(p, options=options, extent=3.0) for p in (0.0, 0.5, 1.0))
+    begin, halfway, end = (
+        rates_at(p, rates=rates, options=FitOptions(), extent=3.0) for p in (0.0, 0.5, 1.0)
+    )
     assert (begin.means, end.means) == pytest.approx((3 * means[0], 3 * means[1]))
     assert halfway.means == pytest.approx(3 * (means[0] * means[1]) ** 0.5)
     assert (begin.log_scales, halfway.log_scales, end.log_scales) == pytest.approx(

@@ -9,7 +9,7 @@ from splatseg.core import Camera, Capture, Gaussians
 from splatseg.errors import InputError, RangeError, SplatsegError
 from splatseg.evaluate import evaluate_photographs, psnr, render_and_photograph
 from splatseg.fit import FitOptions, Refinement, fit, refine
-from splatseg.fit._options import COLOUR_RATE, RATES
+from splatseg.fit._options import COLOUR_RATE, REFINEMENT_RATES
 from splatseg.fit._refine import MaskedView, needed, reduction_for
 from splatseg.lift import GaussianField
 from splatseg.render.cpu import set_threads, threads
@@ -132,7 +132,7 @@ def test_rates_fall_from_those_of_the_start_to_those_of_the_end(make_capture, ti
         return float((found.sh[:, 0] - worse(tiny).sh[:, 0]).abs().max())
 
     assert moved(0.0) == pytest.approx(COLOUR_RATE, rel=0.02)
-    assert moved(1.0) == pytest.approx(COLOUR_RATE * RATES["fast"].final, rel=0.02)
+    assert moved(1.0) == pytest.approx(COLOUR_RATE * REFINEMENT_RATES["fast"].final, rel=0.02)
 
 
 def test_every_step_has_the_rates_of_its_progress(make_capture, tiny, monkeypatch) -> None:

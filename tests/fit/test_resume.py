@@ -79,10 +79,13 @@ VARIANTS = {
 
 @pytest.mark.parametrize("options", VARIANTS.values(), ids=VARIANTS.keys())
 def test_stops_change_no_bit(capture: Capture, path: Path, options: FitOptions) -> None:
-    """Around steps 20, 30 and 40 the number of Gaussians changes; each piece is a new process'."""
+    """Around steps 20, 30 and 40 the number of Gaussians changes, from 45 on they are averaged.
+
+    Each piece is a new process'.
+    """
     straight = fit(capture, options=options)
     assert len(straight.gaussians) != 60, "densification must take part"
-    for stop in (1, 19, 20, 21, 30, 47):
+    for stop in (1, 19, 20, 21, 30, 47, 52):
         checkpoints = Checkpoints(path=path, resume=True)
         piece = fit(capture, options=options, checkpoints=checkpoints, progress=_stop_after(stop))
         assert piece.interrupted
@@ -381,7 +384,7 @@ def test_states_that_do_not_fit_are_refused(capture: Capture, path: Path) -> Non
         tensors={"parameters/logits": torch.zeros(60, 1, dtype=torch.float64)}
     )
     assert "an order of the training views" in refused(tensors={"order": torch.tensor([11])})
-    assert "expected nothing in density, got more" in refused(
+    assert "expected last_shown in density, got last_shown, more" in refused(
         tensors={"density/more": torch.zeros(3)}
     )
     assert "expected a number 'steps', got 'many'" in refused(steps="many")

@@ -5,12 +5,13 @@ from dataclasses import dataclass
 from functools import cache
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from splatseg.core import Camera
+from splatseg.core import Camera, Gaussians
 from splatseg.core.rigid import rotation_from_quaternion
-from splatseg.fit._options import DEAD_OPACITY, FitOptions
+from splatseg.core.sh import SH_C0
+from splatseg.fit._options import DEAD_OPACITY, RATES, FitOptions
 from splatseg.fit._parameters import Parameters, count_at
 
 State = tuple[Parameters, Parameters, Parameters]
@@ -24,9 +25,25 @@ class NoDensification:
     """True if `add_view` needs gradients with respect to the projected centres."""
 
     def add_view(
-        self, rows: Tensor, gradients: Tensor, *, camera: Camera, parameters: Parameters
+        self,
+        rows: Int64[Tensor, "m"],
+        gradients: Gaussians,
+        *,
+        screen: Float[Tensor, "m 2"] | None,
+        camera: Camera,
+        parameters: Parameters,
+        steps: int,
     ) -> None:
-        """Record a view: its rows, and gradients (m, 2) of their projected centres, per pixel."""
+        """Record the view of a step.
+
+        Args:
+            rows: Gaussians that may be visible in it.
+            gradients: Of the loss with respect to these.
+            screen: Gradients of their projected centres, per pixel, where they are needed.
+            camera: As it was rendered.
+            parameters: Of all Gaussians.
+            steps: Steps of the fit, this one included.
+        """
 
     def after_step(
         self, state: State, *, steps: int, progress: float, generator: torch.Generator
@@ -43,11 +60,43 @@ class NoDensification:
 
 
 class MCMCStrategy(NoDensification):
-    """Relocate dead Gaussians to live ones, and grow the number on a schedule (`relocated`)."""
+    """Relocate dead Gaussians to live ones, and grow the number on a schedule (`relocated`).
 
-    def __init__(self, options: FitOptions, *, start: int) -> None:
+    Dead are those whose opacity has decayed (Kheradmand et al. 2024), and those that are hidden:
+    behind or inside surfaces there is no gradient by which an opacity could decay, so that they
+    would stay, and be copied as often as any other. One is hidden of which no step of the last
+    `Rates.hidden_epochs` has shown a tenth of a pixel.
+
+    Args:
+        options: Of the fit.
+        start: Gaussians at the start.
+        views: Training views, each once in an epoch.
+    """
+
+    def __init__(self, options: FitOptions, *, start: int, views: int) -> None:
         self._options = options
         self._start = start
+        self._hidden_after = views * RATES[options.rates].hidden_epochs
+        self._last_shown = torch.zeros(start, dtype=torch.int64)
+
+    def add_view(
+        self,
+        rows: Int64[Tensor, "m"],
+        gradients: Gaussians,
+        *,
+        screen: Float[Tensor, "m 2"] | None,
+        camera: Camera,
+        parameters: Parameters,
+        steps: int,
+    ) -> None:
+        """Record which Gaussians the step has shown."""
+        shown = shown_pixels(
+            gradients,
+            opacities=parameters.logits[rows].sigmoid().squeeze(1),
+            pixels=camera.width * camera.height,
+        )
+        self._last_shown = self._last_shown.to(rows.device)
+        self._last_shown[rows[shown >= _MIN_SHOWN]] = steps
 
     def after_step(
         self, state: State, *, steps: int, progress: float, generator: torch.Generator
@@ -55,8 +104,22 @@ class MCMCStrategy(NoDensification):
         """Relocate every `FitOptions.densify_every` steps."""
         if not _round_due(self._options, steps=steps, progress=progress):
             return state
+        hidden = steps - self._last_shown >= self._hidden_after
+        dead = (state[0].logits.sigmoid().squeeze(1) <= DEAD_OPACITY) | hidden
         count = count_at(progress, options=self._options, start=self._start)
-        return relocated(*state, count=count, generator=generator)
+        after = relocated(*state, dead=dead, count=count, generator=generator)
+        last_shown = self._last_shown.masked_fill(dead, steps)
+        added = last_shown.new_full((len(after[0]) - len(last_shown),), steps)
+        self._last_shown = torch.cat((last_shown, added))
+        return after
+
+    def state(self) -> dict[str, Tensor]:
+        """The step that has shown each Gaussian last."""
+        return {"last_shown": self._last_shown}
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Restore what `state` returned."""
+        self._last_shown = tensors["last_shown"]
 
 
 class DefaultStrategy(NoDensification):
@@ -73,10 +136,18 @@ class DefaultStrategy(NoDensification):
         self._resets = 0
 
     def add_view(
-        self, rows: Tensor, gradients: Tensor, *, camera: Camera, parameters: Parameters
+        self,
+        rows: Int64[Tensor, "m"],
+        gradients: Gaussians,
+        *,
+        screen: Float[Tensor, "m 2"] | None,
+        camera: Camera,
+        parameters: Parameters,
+        steps: int,
     ) -> None:
         """Add to the gradients since the last round."""
-        self._statistics.add(rows, gradients, camera=camera, parameters=parameters)
+        if screen is not None:
+            self._statistics.add(rows, screen, camera=camera, parameters=parameters)
 
     def after_step(
         self, state: State, *, steps: int, progress: float, generator: torch.Generator
@@ -112,19 +183,22 @@ class DefaultStrategy(NoDensification):
 
 
 def strategy_of(
-    options: FitOptions, *, start: int, extent: float, device: torch.device
+    options: FitOptions, *, start: int, views: int, extent: float, device: torch.device
 ) -> NoDensification:
     """The strategy that the options name.
 
     Args:
         options: Strategy and intervals.
         start: Gaussians at the start.
+        views: Training views.
         extent: Size of the scene, scene units.
         device: Where the parameters are.
     """
     if options.strategy == "classic":
         return DefaultStrategy(options, start=start, extent=extent, device=device)
-    return NoDensification() if options.strategy == "fixed" else MCMCStrategy(options, start=start)
+    if options.strategy == "fixed":
+        return NoDensification()
+    return MCMCStrategy(options, start=start, views=views)
 
 
 def _round_due(options: FitOptions, *, steps: int, progress: float) -> bool:
@@ -140,6 +214,8 @@ _MAX_COPIES = 51
 # Shared opacities are kept this far from 0 and 1, so that their logits are finite.
 _MIN_OPACITY = 0.005
 _MIN_TRANSPARENCY = 1e-6
+# Pixels of a Gaussian that a step must show, so that it is not hidden.
+_MIN_SHOWN = 0.1
 # Largest growth of one round, as a share of the current number: copies need steps to diverge.
 _MAX_GROWTH = 0.5
 
@@ -179,11 +255,36 @@ def _binomial_sums() -> Tensor:
     return rows.cumsum(dim=0)
 
 
+def shown_pixels(
+    gradients: Gaussians, *, opacities: Float[Tensor, "m"], pixels: int
+) -> Float[Tensor, "m"]:
+    r"""About how many pixels of each Gaussian a step has shown, by the gradients of its loss.
+
+    With :math:`w_p` its blending weight, c its colour, o its opacity and :math:`b_p` what is behind
+    it, :math:`\partial I_p / \partial c = w_p` and
+    :math:`\partial I_p / \partial o = w_p (c - b_p) / o`. The L1 loss is a mean over pixels and
+    channels, so that with its gradients g
+
+    .. math:: \max(3 P |g_c|, \; P \, o \, |g_o|) \le \sum_p w_p,
+
+    the more below it the more signs differ. The colour of what is black has no gradient, as colours
+    end at 0; its opacity has.
+
+    Args:
+        gradients: Of the loss with respect to the Gaussians.
+        opacities: Of these.
+        pixels: Of the image.
+    """
+    colour = 3 * gradients.sh[:, 0].abs().amax(dim=1) / SH_C0
+    return pixels * torch.maximum(colour, opacities * gradients.opacities.abs())
+
+
 def relocated(
     parameters: Parameters,
     first: Parameters,
     second: Parameters,
     *,
+    dead: Bool[Tensor, "n"],
     count: int,
     generator: torch.Generator,
 ) -> State:
@@ -196,11 +297,11 @@ def relocated(
         parameters: The Gaussians.
         first: Adam's first moments.
         second: Adam's second moments.
+        dead: Which are relocated.
         count: How many Gaussians there should be; never fewer than there are.
         generator: Source of randomness, on the CPU.
     """
     opacities = parameters.logits.sigmoid().squeeze(1)
-    dead = opacities <= DEAD_OPACITY
     if bool(dead.all()):
         return parameters, first, second
     added = max(0, min(count - len(parameters), int(_MAX_GROWTH * len(parameters))))

@@ -62,16 +62,25 @@ class Rates:
     sh_degree_interval: float
     """Progress between one degree of the spherical harmonics and the next."""
 
+    average_from: float
+    """Progress from which on the parameters are averaged, see `TailAverage`; infinity for none."""
+
+    hidden_epochs: float
+    """mcmc: epochs after which Gaussians that no view has shown are relocated, at least 2, in which
+    each view has its turn; infinity for never."""
+
 
 RATES = {
     "fast": Rates(
         position=8e-4,
         position_end=8e-6,
         scale=1e-2,
-        final=0.2,
+        final=1.0,
         quarter_until=0.02,
         half_until=0.07,
         sh_degree_interval=0.1,
+        average_from=0.8,
+        hidden_epochs=2.0,
     ),
     "published": Rates(
         position=1.6e-4,
@@ -81,7 +90,15 @@ RATES = {
         quarter_until=0.0,
         half_until=0.0,
         sh_degree_interval=1 / 30,
+        average_from=math.inf,
+        hidden_epochs=math.inf,
     ),
+}
+
+# Refinements are short and are not averaged, so their rates decay.
+REFINEMENT_RATES = {
+    "fast": replace(RATES["fast"], final=0.2),
+    "published": RATES["published"],
 }
 
 Background = str | tuple[float, float, float]
@@ -175,8 +192,10 @@ class FitOptions:
     """Weight of D-SSIM in the loss, the rest is L1."""
 
     rates: Literal["fast", "published"] = "fast"
-    """Learning rates and coarse-to-fine stages. fast: measured best on fits of minutes, the first
-    7 % of which see downsampled photographs. published: those of 3DGS, for 30 000 steps."""
+    """Learning rates, coarse-to-fine stages, and what a fit does with them. fast: measured best on
+    fits of minutes; the first 7 % see downsampled photographs, Gaussians that no photograph shows
+    are relocated (mcmc), and the parameters are averaged over the last fifth. published: those of
+    3DGS, for 30 000 steps, without any of it."""
 
     opacity_penalty: NonNegative = 0.01
     """Weight of the mean opacity in the loss, a regulariser: unneeded opacities decay."""

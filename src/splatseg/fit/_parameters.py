@@ -12,7 +12,14 @@ from splatseg.core import Camera, Gaussians
 from splatseg.core.chunks import MARGIN, REACH
 from splatseg.core.gaussians import exponential, sigmoid
 from splatseg.core.rigid import rotation_from_quaternion
-from splatseg.fit._options import COLOUR_RATE, OPACITY_RATE, RATES, ROTATION_RATE, FitOptions
+from splatseg.fit._options import (
+    COLOUR_RATE,
+    OPACITY_RATE,
+    RATES,
+    ROTATION_RATE,
+    FitOptions,
+    Rates,
+)
 
 # More than the square root of the low-pass variance of 0.3 square pixels.
 _LOW_PASS_SIGMA = 0.55
@@ -217,9 +224,8 @@ class StepRates:
     """Spherical harmonics of degrees 1 to 3."""
 
 
-def rates_at(progress: float, *, options: FitOptions, extent: float) -> StepRates:
+def rates_at(progress: float, *, rates: Rates, options: FitOptions, extent: float) -> StepRates:
     """Learning rates at a progress: each decays exponentially from its start to its end."""
-    rates = RATES[options.rates]
     start, end = rates.position, rates.position_end
     left = rates.final**progress
     means = 0.0 if options.strategy == "fixed" else extent * start * (end / start) ** progress

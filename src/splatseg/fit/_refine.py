@@ -16,7 +16,7 @@ from splatseg._check import check_range
 from splatseg.core import Camera, Gaussians, View
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError
-from splatseg.fit._options import FitOptions
+from splatseg.fit._options import REFINEMENT_RATES, FitOptions
 from splatseg.fit._parameters import (
     Parameters,
     UpdateSettings,
@@ -150,7 +150,13 @@ class Refinement:
         )
         found = self._training.gradients(self._state[0], example, settings=settings)
         self._steps_done += 1
-        rates = rates_at(progress, options=self._options, extent=self._extent)
+        options = self._options
+        rates = rates_at(
+            progress,
+            rates=REFINEMENT_RATES[options.rates],
+            options=options,
+            extent=self._extent,
+        )
         with torch.no_grad():
             update = UpdateSettings(rates=rates, step=self._steps_done)
             self._training.update(self._state, found, settings=update)

@@ -12,6 +12,7 @@ from splatseg.core import Camera, Capture, Gaussians, View
 from splatseg.core.boundary import boundary
 from splatseg.core.checkpoints import Checkpoints, Interrupts, deferred_interrupts
 from splatseg.errors import FileFormatError, InputError
+from splatseg.fit._average import TailAverage
 from splatseg.fit._checkpoint import (
     CheckpointClock,
     FitState,
@@ -22,12 +23,13 @@ from splatseg.fit._checkpoint import (
 )
 from splatseg.fit._density import strategy_of
 from splatseg.fit._objects import ObjectRounds, ObjectSupervision
-from splatseg.fit._options import DEAD_OPACITY, FitOptions
+from splatseg.fit._options import DEAD_OPACITY, RATES, FitOptions
 from splatseg.fit._parameters import (
     Parameters,
     UpdateSettings,
     degree_at,
     final_gaussians,
+    gradients_of,
     rates_at,
     reduction_at,
 )
@@ -258,8 +260,13 @@ class FitRun:
             self._restore(saved)
         growth = options if self._objects is None else self._objects.growth
         self._density = strategy_of(
-            growth, start=self._start_count, extent=self._extent, device=self._device
+            growth,
+            start=self._start_count,
+            views=len(photographs),
+            extent=self._extent,
+            device=self._device,
         )
+        self._average = TailAverage(RATES[options.rates].average_from)
         if saved is not None:
             for name, module in self._modules().items():
                 module.restore(saved.group(name, module.state(), device=self._device))
@@ -285,7 +292,7 @@ class FitRun:
         return self.progress >= 1.0
 
     def gaussians(self) -> Gaussians:
-        found = final_gaussians(self._state[0])
+        found = final_gaussians(self._average.of(self._state[0]))
         if self._options.strategy != "fixed":
             found = found[found.opacities > DEAD_OPACITY]
         return self.views.in_capture_frame(
@@ -328,6 +335,8 @@ class FitRun:
     def _modules(self) -> dict[str, StatefulModule]:
         """Modules with state of their own, by the name of their group in the checkpoint."""
         found: dict[str, StatefulModule] = {"density": self._density}
+        if self._average.wanted:
+            found["average"] = self._average
         if self._objects is not None:
             found["objects"] = self._objects
         return found | self.views.stateful_modules()
@@ -383,13 +392,16 @@ class FitRun:
             self._update(found, done)
             self.views.update(example.index, progress=done)
         self.steps += 1
+        before = self._state
         with self._training.timed("densify"), torch.no_grad():
-            if found.screen_gradients is not None:
+            if done < self._options.densify_until:
                 self._density.add_view(
                     found.rows,
-                    found.screen_gradients,
+                    gradients_of(found.gaussians),
+                    screen=found.screen_gradients,
                     camera=example.camera,
                     parameters=parameters,
+                    steps=self.steps,
                 )
             self._state = self._density.after_step(
                 self._state, steps=self.steps, progress=done, generator=self._generator
@@ -397,6 +409,10 @@ class FitRun:
         if self._objects is not None:
             with self._training.timed("objects"), torch.no_grad():
                 self._state = self._objects.after_step(self._state, progress=self.progress)
+        with self._training.timed("update"), torch.no_grad():
+            if self._state is not before:
+                self._average.restart()
+            self._average.add(self._state[0], steps=self.steps, progress=self.progress)
         return self._report(found.loss)
 
     def _reduction(self, camera: Camera, progress: float) -> int:
@@ -406,7 +422,8 @@ class FitRun:
 
     def _update(self, found: StepGradients, progress: float) -> None:
         count = len(self._state[0])
-        rates = rates_at(progress, options=self._options, extent=self._extent)
+        options = self._options
+        rates = rates_at(progress, rates=RATES[options.rates], options=options, extent=self._extent)
         unit = _REFERENCE_SIZE / self._size
         settings = UpdateSettings(
             rates=rates,
