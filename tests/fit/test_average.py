@@ -50,6 +50,15 @@ def test_after_a_restart_only_what_comes_later_counts() -> None:
     assert average.of(fewer).logits.tolist() == [[1.5], [1.5]]
 
 
+def test_a_fit_that_goes_on_to_a_later_end_begins_anew() -> None:
+    average = TailAverage(0.8)
+    average.add(parameters(5.0), steps=100, progress=1.0)
+    average.add(now := parameters(3.0), steps=101, progress=0.5)
+    assert average.of(now) is now
+    average.add(parameters(1.0), steps=170, progress=0.85)
+    assert float(average.of(now).logits[0, 0]) == 1.0
+
+
 def test_a_restored_one_goes_on() -> None:
     first = TailAverage(0.0)
     second = TailAverage(0.0)

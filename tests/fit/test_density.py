@@ -163,14 +163,14 @@ def _strategy(rates="fast", start=4) -> MCMCStrategy:
     return MCMCStrategy(options, start=start, views=5)
 
 
-def _show(strategy: MCMCStrategy, rows: list[int], *, steps: int, parameters: Parameters) -> None:
+def _show(strategy: MCMCStrategy, rows: list[int], *, steps: int, state: tuple) -> None:
     """A step that shows a pixel of each of these rows."""
     strategy.add_view(
-        torch.tensor(rows),
+        torch.tensor(rows, dtype=torch.int64),
         _gradients([SH_C0 / (3 * 40 * 30)] * len(rows), [0.0] * len(rows)),
         screen=None,
         camera=CAMERA,
-        parameters=parameters,
+        parameters=state[0],
         steps=steps,
     )
 
@@ -212,9 +212,11 @@ def test_what_no_view_has_shown_in_two_epochs_is_relocated() -> None:
     parameters = _parameters([0.5, 0.6, 0.7, 0.8])
     state = (parameters, _ones(parameters), _ones(parameters))
     strategy, generator = _strategy(), torch.Generator().manual_seed(0)
-    for steps, rows in ((2, [2]), (11, [0, 1]), (17, [0])):
-        _show(strategy, rows, steps=steps, parameters=parameters)
-        assert strategy.after_step(state, steps=9, progress=0.1, generator=generator) is state
+    for steps in range(1, 21):
+        _show(strategy, {2: [2], 11: [0, 1], 17: [0]}.get(steps, []), steps=steps, state=state)
+        if steps == 9:
+            after = strategy.after_step(state, steps=steps, progress=0.1, generator=generator)
+            assert after is state
     # Two epochs of five views: 3 was never shown, 2 in step 2, 1 in step 11, 0 in step 17.
     after = strategy.after_step(state, steps=20, progress=0.1, generator=generator)
     moved = (after[0].means != parameters.means).any(dim=1)
@@ -222,6 +224,20 @@ def test_what_no_view_has_shown_in_two_epochs_is_relocated() -> None:
     assert all(float(row) in parameters.means[:2, 0].tolist() for row in after[0].means[2:, 0])
     # They are as new as if they had been shown now.
     assert strategy.state()["last_shown"].tolist() == [17, 11, 20, 20]
+
+
+def test_a_fit_that_goes_on_to_a_later_end_looks_two_epochs_again() -> None:
+    """Steps after densify_until are not recorded, and rows may be others since."""
+    parameters = _parameters([0.5, 0.6, 0.7, 0.8])
+    state = (parameters, _ones(parameters), _ones(parameters))
+    strategy, generator = _strategy(start=3), torch.Generator().manual_seed(0)
+    _show(strategy, [0], steps=1, state=tuple(one.rows(torch.arange(3)) for one in state))
+    for steps in range(495, 506):
+        _show(strategy, [1], steps=steps, state=state)
+        if steps == 500:
+            after = strategy.after_step(state, steps=steps, progress=0.5, generator=generator)
+            assert after[0] is parameters
+    assert strategy.state()["last_shown"].tolist() == [494, 505, 494, 494]
 
 
 def test_a_tenth_of_a_pixel_is_shown() -> None:
@@ -234,10 +250,10 @@ def test_a_tenth_of_a_pixel_is_shown() -> None:
         screen=None,
         camera=CAMERA,
         parameters=parameters,
-        steps=7,
+        steps=1,
     )
     # The pull of an opacity of a half counts half.
-    assert strategy.state()["last_shown"].tolist() == [0, 7, 0, 7]
+    assert strategy.state()["last_shown"].tolist() == [0, 1, 0, 1]
 
 
 def test_published_rates_relocate_the_transparent_alone() -> None:
@@ -257,9 +273,11 @@ def test_the_added_are_as_if_shown_now_and_a_restored_one_goes_on() -> None:
         start=4,
         views=50,
     )
-    _show(strategy, [1], steps=3, parameters=parameters)
+    state = (parameters, _ones(parameters), _ones(parameters))
+    for steps in (1, 2, 3):
+        _show(strategy, [1], steps=steps, state=state)
     after = strategy.after_step(
-        (parameters, _ones(parameters), _ones(parameters)),
+        state,
         steps=10,
         progress=0.55,
         generator=torch.Generator().manual_seed(0),
@@ -268,6 +286,7 @@ def test_the_added_are_as_if_shown_now_and_a_restored_one_goes_on() -> None:
     other = _strategy()
     other.restore(strategy.state())
     assert other.state()["last_shown"].tolist() == [0, 3, 0, 0, 10, 10]
+    assert int(other.state()["recorded"]) == 3
 
 
 # Classic densification: each rule on a scene of a few Gaussians.

@@ -384,7 +384,7 @@ def test_states_that_do_not_fit_are_refused(capture: Capture, path: Path) -> Non
         tensors={"parameters/logits": torch.zeros(60, 1, dtype=torch.float64)}
     )
     assert "an order of the training views" in refused(tensors={"order": torch.tensor([11])})
-    assert "expected last_shown in density, got last_shown, more" in refused(
+    assert "expected last_shown, recorded in density, got last_shown, more, recorded" in refused(
         tensors={"density/more": torch.zeros(3)}
     )
     assert "expected a number 'steps', got 'many'" in refused(steps="many")

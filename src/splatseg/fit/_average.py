@@ -38,7 +38,11 @@ class TailAverage:
 
     def add(self, parameters: Parameters, *, steps: int, progress: float) -> None:
         """Count the parameters in after a step, if it is due."""
-        if progress < self._start or steps % _INTERVAL:
+        if progress < self._start:
+            # Before it begins, or again before it, where a finished fit goes on to a later end.
+            self.restart()
+            return
+        if steps % _INTERVAL:
             return
         self._count += 1
         if self._mean is None:

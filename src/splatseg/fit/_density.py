@@ -78,6 +78,7 @@ class MCMCStrategy(NoDensification):
         self._start = start
         self._hidden_after = views * RATES[options.rates].hidden_epochs
         self._last_shown = torch.zeros(start, dtype=torch.int64)
+        self._recorded = 0
 
     def add_view(
         self,
@@ -95,8 +96,13 @@ class MCMCStrategy(NoDensification):
             opacities=parameters.logits[rows].sigmoid().squeeze(1),
             pixels=camera.width * camera.height,
         )
+        if steps != self._recorded + 1 or len(self._last_shown) != len(parameters):
+            # A finished fit that goes on, to a later end: steps after `densify_until` were not
+            # recorded, and in them objects may have changed the rows.
+            self._last_shown = rows.new_full((len(parameters),), steps - 1)
         self._last_shown = self._last_shown.to(rows.device)
         self._last_shown[rows[shown >= _MIN_SHOWN]] = steps
+        self._recorded = steps
 
     def after_step(
         self, state: State, *, steps: int, progress: float, generator: torch.Generator
@@ -114,12 +120,13 @@ class MCMCStrategy(NoDensification):
         return after
 
     def state(self) -> dict[str, Tensor]:
-        """The step that has shown each Gaussian last."""
-        return {"last_shown": self._last_shown}
+        """The step that has shown each Gaussian last, and the last that was recorded."""
+        return {"last_shown": self._last_shown, "recorded": torch.tensor([self._recorded])}
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Restore what `state` returned."""
         self._last_shown = tensors["last_shown"]
+        self._recorded = int(tensors["recorded"])
 
 
 class DefaultStrategy(NoDensification):
