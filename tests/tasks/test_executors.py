@@ -147,11 +147,12 @@ def test_one_that_is_closed_begins_no_further_item(executor, tmp_path) -> None:
 # Workers.
 
 
-def test_what_is_closed_ends_what_runs(workers, tmp_path) -> None:
+@pytest.mark.parametrize("lost", [0, 1])
+def test_what_is_closed_ends_what_runs(workers, tmp_path, lost: int) -> None:
     (there := tmp_path / "there").mkdir()
     assert max(workers.map(executed.together, range(4), shared=(there, 2))) == 2, "both run"
     (folder := tmp_path / "late").mkdir()
-    found = workers.map(executed.late, range(6), shared=folder)
+    found = workers.map(executed.late, range(6), shared=(folder, lost))
     assert next(found) == 0
     found.close()
     (again := tmp_path / "again").mkdir()

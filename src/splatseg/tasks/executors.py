@@ -52,6 +52,9 @@ _SECONDS = 5.0
 _INTERRUPTED = 0.5
 """Seconds after which who waits for a worker looks whether it was asked to stop."""
 
+_CANCELS, _CANCELLED = 5, 1.0
+"""How often what goes on is cancelled, and the seconds that it has each time to end."""
+
 _SETTINGS = bytes((0, 0, 0, 4, 0, 0, 0, 0, 0))
 """The frame by which either side of HTTP/2 begins: of length 0 and type 4."""
 
@@ -242,8 +245,18 @@ class RayExecutor:
                     pending.popleft()
                     yield from results
         finally:
-            for task in pending:
+            self._end(pending)
+
+    def _end(self, tasks: Iterable[Any]) -> None:
+        """Cancel what runs, and what waits for a worker."""
+        left = list(tasks)
+        for _ in range(_CANCELS):
+            if not left:
+                return
+            for task in left:
                 self._ray.cancel(task)
+            # What Ray interrupts can miss it: an exception in a destructor, say, is dropped.
+            left = self._ray.wait(left, num_returns=len(left), timeout=_CANCELLED)[1]
 
     def _unfinished(self, pending: Iterable[Any]) -> list[Any]:
         tasks = list(pending)
