@@ -8,6 +8,7 @@ import torch
 
 from splatseg.fit import FitOptions
 from splatseg.fit._average import TailAverage
+from splatseg.fit._density import strategy_of
 from splatseg.fit._parameters import Parameters
 from splatseg.fit._photographs import TrainingPhotographs
 from splatseg.fit._run import FitRun
@@ -98,3 +99,43 @@ def test_rows_that_change_begin_anew(make_capture, with_rates) -> None:
         run.step()
         counts.append(int(run.state().tensors["average/count"]))
     assert [counts[step - 1] for step in (39, 40, 69, 70, 79, 80)] == [0, 1, 1, 1, 1, 2]
+
+
+def test_the_fast_rates_average_the_last_fifth(make_capture) -> None:
+    run = run_of(make_capture, OPTIONS)
+    while not run.finished:
+        run.step()
+    # Of 80 steps from 64 on: 70 and 80.
+    assert int(run.state().tensors["average/count"]) == 2
+
+
+@pytest.mark.parametrize("strategy", ["mcmc", "classic"])
+def test_density_control_is_told_of_views(make_capture, monkeypatch, strategy) -> None:
+    told: list[object] = []
+
+    def watched(options, **known):
+        found = strategy_of(options, **known)
+        record = found.add_view
+
+        def add_view(rows, gradients, *, screen, steps, **rest):
+            told.append((steps, None if screen is None else len(screen) == len(rows)))
+            record(rows, gradients, screen=screen, steps=steps, **rest)
+
+        found.add_view = add_view
+        told.append(known["views"])
+        return found
+
+    monkeypatch.setattr("splatseg.fit._run.strategy_of", watched)
+    capture = make_capture()
+    options = replace(OPTIONS, densify_until=0.05).with_strategy(strategy)
+    run = FitRun(
+        capture,
+        replace(options, densify_until=0.05),
+        get_backend("cpu"),
+        TrainingPhotographs.of(capture.train_views, options=options),
+    )
+    for _ in range(8):
+        run.step()
+    screen = None if strategy == "mcmc" else True
+    # Of 80 steps those before progress 0.05.
+    assert told == [len(capture.train_views), *((steps, screen) for steps in (1, 2, 3, 4))]
