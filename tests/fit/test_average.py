@@ -117,9 +117,10 @@ def test_density_control_is_told_of_views(make_capture, monkeypatch, strategy) -
         found = strategy_of(options, **known)
         record = found.add_view
 
-        def add_view(rows, gradients, *, screen, steps, **rest):
-            told.append((steps, None if screen is None else len(screen) == len(rows)))
-            record(rows, gradients, screen=screen, steps=steps, **rest)
+        def add_view(view, parameters):
+            screen = view.screen
+            told.append((view.steps, None if screen is None else len(screen) == len(view.rows)))
+            record(view, parameters)
 
         found.add_view = add_view
         told.append(known["views"])

@@ -12,6 +12,7 @@ from splatseg.fit._density import (
     DefaultStrategy,
     MCMCStrategy,
     ScreenStatistics,
+    SeenView,
     densified,
     relocated,
     shared_shape,
@@ -165,14 +166,14 @@ def _strategy(rates="fast", start=4) -> MCMCStrategy:
 
 def _show(strategy: MCMCStrategy, rows: list[int], *, steps: int, state: tuple) -> None:
     """A step that shows a pixel of each of these rows."""
-    strategy.add_view(
-        torch.tensor(rows, dtype=torch.int64),
-        _gradients([SH_C0 / (3 * 40 * 30)] * len(rows), [0.0] * len(rows)),
+    seen = SeenView(
+        rows=torch.tensor(rows, dtype=torch.int64),
+        gradients=_gradients([SH_C0 / (3 * 40 * 30)] * len(rows), [0.0] * len(rows)),
         screen=None,
         camera=CAMERA,
-        parameters=state[0],
         steps=steps,
     )
+    strategy.add_view(seen, state[0])
 
 
 def test_pixels_shown_are_the_sum_of_weights() -> None:
@@ -245,14 +246,16 @@ def test_a_tenth_of_a_pixel_is_shown() -> None:
     parameters = _parameters([0.5, 0.5, 0.5, 0.5])
     strategy = _strategy()
     unit = SH_C0 / (3 * 40 * 30)
-    strategy.add_view(
-        torch.tensor([3, 2, 1, 0]),
-        _gradients([0.101 * unit, -0.099 * unit, 0.0, 0.0], [0, 0, 0.21 / 1200, -0.19 / 1200]),
+    seen = SeenView(
+        rows=torch.tensor([3, 2, 1, 0]),
+        gradients=_gradients(
+            [0.101 * unit, -0.099 * unit, 0.0, 0.0], [0, 0, 0.21 / 1200, -0.19 / 1200]
+        ),
         screen=None,
         camera=CAMERA,
-        parameters=parameters,
         steps=1,
     )
+    strategy.add_view(seen, parameters)
     # The pull of an opacity of a half counts half.
     assert strategy.state()["last_shown"].tolist() == [0, 1, 0, 1]
 
@@ -482,14 +485,14 @@ def test_statistics_go_on_after_a_restore():
     camera = Camera(
         width=2, height=2, fx=1.0, fy=1.0, cx=1, cy=1, cam_from_world=torch.eye(4).double()
     )
-    one.add_view(
-        torch.tensor([1]),
-        _gradients([0.0], [0.0]),
+    seen = SeenView(
+        rows=torch.tensor([1]),
+        gradients=_gradients([0.0], [0.0]),
         screen=torch.ones(1, 2),
         camera=camera,
-        parameters=state[0],
         steps=42,
     )
+    one.add_view(seen, state[0])
     other = DefaultStrategy(options, start=2, extent=EXTENT, device=torch.device("cpu"))
     other.restore(one.state())
     assert other.state().keys() == {"gradients", "views", "radii", "resets"}

@@ -18,32 +18,34 @@ State = tuple[Parameters, Parameters, Parameters]
 """Parameters and Adam's first and second moments."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SeenView:
+    """What a step has seen of the Gaussians in its view."""
+
+    rows: Int64[Tensor, "m"]
+    """Those that may be visible in it."""
+
+    gradients: Gaussians
+    """Of the loss with respect to these."""
+
+    screen: Float[Tensor, "m 2"] | None
+    """Gradients of their projected centres, per pixel; None unless they are needed."""
+
+    camera: Camera
+    """As it was rendered."""
+
+    steps: int
+    """Steps of the fit, this one included."""
+
+
 class NoDensification:
     """Neither adds nor removes Gaussians; the other strategies begin with this."""
 
     needs_screen_gradients = False
     """True if `add_view` needs gradients with respect to the projected centres."""
 
-    def add_view(
-        self,
-        rows: Int64[Tensor, "m"],
-        gradients: Gaussians,
-        *,
-        screen: Float[Tensor, "m 2"] | None,
-        camera: Camera,
-        parameters: Parameters,
-        steps: int,
-    ) -> None:
-        """Record the view of a step.
-
-        Args:
-            rows: Gaussians that may be visible in it.
-            gradients: Of the loss with respect to these.
-            screen: Gradients of their projected centres, per pixel, where they are needed.
-            camera: As it was rendered.
-            parameters: Of all Gaussians.
-            steps: Steps of the fit, this one included.
-        """
+    def add_view(self, view: SeenView, parameters: Parameters) -> None:
+        """Record the view of a step. The parameters are of all Gaussians."""
 
     def after_step(
         self, state: State, *, steps: int, progress: float, generator: torch.Generator
@@ -80,29 +82,21 @@ class MCMCStrategy(NoDensification):
         self._last_shown = torch.zeros(start, dtype=torch.int64)
         self._recorded = 0
 
-    def add_view(
-        self,
-        rows: Int64[Tensor, "m"],
-        gradients: Gaussians,
-        *,
-        screen: Float[Tensor, "m 2"] | None,
-        camera: Camera,
-        parameters: Parameters,
-        steps: int,
-    ) -> None:
+    def add_view(self, view: SeenView, parameters: Parameters) -> None:
         """Record which Gaussians the step has shown."""
+        rows = view.rows
         shown = shown_pixels(
-            gradients,
+            view.gradients,
             opacities=parameters.logits[rows].sigmoid().squeeze(1),
-            pixels=camera.width * camera.height,
+            pixels=view.camera.width * view.camera.height,
         )
-        if steps != self._recorded + 1 or len(self._last_shown) != len(parameters):
+        if view.steps != self._recorded + 1 or len(self._last_shown) != len(parameters):
             # A finished fit that goes on, to a later end: steps after `densify_until` were not
             # recorded, and in them objects may have changed the rows.
-            self._last_shown = rows.new_full((len(parameters),), steps - 1)
+            self._last_shown = rows.new_full((len(parameters),), view.steps - 1)
         self._last_shown = self._last_shown.to(rows.device)
-        self._last_shown[rows[shown >= _MIN_SHOWN]] = steps
-        self._recorded = steps
+        self._last_shown[rows[shown >= _MIN_SHOWN]] = view.steps
+        self._recorded = view.steps
 
     def after_step(
         self, state: State, *, steps: int, progress: float, generator: torch.Generator
@@ -142,19 +136,10 @@ class DefaultStrategy(NoDensification):
         self._statistics = ScreenStatistics.zeros(start, device)
         self._resets = 0
 
-    def add_view(
-        self,
-        rows: Int64[Tensor, "m"],
-        gradients: Gaussians,
-        *,
-        screen: Float[Tensor, "m 2"] | None,
-        camera: Camera,
-        parameters: Parameters,
-        steps: int,
-    ) -> None:
+    def add_view(self, view: SeenView, parameters: Parameters) -> None:
         """Add to the gradients since the last round."""
-        if screen is not None:
-            self._statistics.add(rows, screen, camera=camera, parameters=parameters)
+        if view.screen is not None:
+            self._statistics.add(view.rows, view.screen, camera=view.camera, parameters=parameters)
 
     def after_step(
         self, state: State, *, steps: int, progress: float, generator: torch.Generator

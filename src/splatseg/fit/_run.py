@@ -21,7 +21,7 @@ from splatseg.fit._checkpoint import (
     named,
     parameters_of,
 )
-from splatseg.fit._density import strategy_of
+from splatseg.fit._density import SeenView, strategy_of
 from splatseg.fit._objects import ObjectRounds, ObjectSupervision
 from splatseg.fit._options import DEAD_OPACITY, RATES, FitOptions
 from splatseg.fit._parameters import (
@@ -29,7 +29,6 @@ from splatseg.fit._parameters import (
     UpdateSettings,
     degree_at,
     final_gaussians,
-    gradients_of,
     rates_at,
     reduction_at,
 )
@@ -395,14 +394,14 @@ class FitRun:
         before = self._state
         with self._training.timed("densify"), torch.no_grad():
             if done < self._options.densify_until:
-                self._density.add_view(
-                    found.rows,
-                    gradients_of(found.gaussians),
+                seen = SeenView(
+                    rows=found.rows,
+                    gradients=found.gradients,
                     screen=found.screen_gradients,
                     camera=example.camera,
-                    parameters=parameters,
                     steps=self.steps,
                 )
+                self._density.add_view(seen, parameters)
             self._state = self._density.after_step(
                 self._state, steps=self.steps, progress=done, generator=self._generator
             )

@@ -88,8 +88,8 @@ class StepGradients:
     rows: Int64[Tensor, "m"]
     """Rows of these Gaussians among all."""
 
-    gaussians: Gaussians
-    """The Gaussians of these rows: leaves that hold gradients."""
+    gradients: Gaussians
+    """Of the loss with respect to the Gaussians of these rows."""
 
     loss: Loss
     """Of the photograph alone."""
@@ -206,14 +206,14 @@ class TrainingStep:
         return StepGradients(
             example=example,
             rows=rows,
-            gaussians=gaussians,
+            gradients=gradients_of(gaussians),
             loss=loss,
             screen_gradients=None if offsets is None else offsets.grad,
         )
 
     def update(self, state: State, found: StepGradients, *, settings: UpdateSettings) -> None:
         """One step of Adam on the visible rows, in place."""
-        update_rows(*state, gradients_of(found.gaussians), rows=found.rows, settings=settings)
+        update_rows(*state, found.gradients, rows=found.rows, settings=settings)
 
     @contextmanager
     def timed(self, stage: str) -> Generator[None]:
