@@ -7,17 +7,21 @@ import numpy as np
 import pytest
 import torch
 
-from splatseg.core import Capture, Gaussians, PointCloud, View
+from splatseg.core import Capture, Edited, Gaussians, PointCloud, View
 from splatseg.core.checkpoints import Checkpoints
 from splatseg.errors import InputError
+from splatseg.evaluate import psnr, render_and_photograph
 from splatseg.fit import FitOptions, FitRecord, FitResult, cut_capture, fit, fit_blocks
-from splatseg.fit.blocks import (
+from splatseg.fit._block_fits import (
     BlockFits,
-    CaptureBlocks,
     block_checkpoint,
     fit_block,
     join_blocks,
+    refine_block,
+    refined_steps,
 )
+from splatseg.fit.blocks import CaptureBlocks
+from splatseg.lift import GaussianField
 from splatseg.synthetic import look_at
 
 OPTIONS = FitOptions(minutes=None, steps=1000, max_gaussians=10_000)
@@ -153,6 +157,23 @@ def test_a_view_that_sees_little_of_a_block_is_not_of_it():
     assert 3 < sum(told) < 22
 
 
+def test_a_block_is_refined_with_views_that_show_a_little_of_it():
+    """A fiftieth is enough, where a fit needs a quarter; nothing is not."""
+    little = []
+    for y in np.linspace(-6, 0, 25):
+        camera = look_at((-1.0, -1.5, 1.2), (1.5, float(y), 1.0), width=64, height=48)
+        turned = View(name="turned", camera=camera, image=Path("turned.png"))
+        block = cut_capture(rooms(wall=False, more=(turned,)), 2, options=OPTIONS).blocks[1]
+        fitted = {view.name for view in block.capture.views}
+        refined = {view.name for view in block.border_views}
+        assert fitted <= refined
+        little.append(("turned" in refined) - ("turned" in fitted))
+    assert 2 < sum(little) < 22
+    left = cut_capture(rooms(), 2, options=OPTIONS).blocks[0]
+    behind = {view.name for view in left.border_views} - {view.name for view in left.capture.views}
+    assert behind <= {"right_floor"}, "whoever looks at a wall shows nothing of what is behind it"
+
+
 def test_each_view_counts_as_in_one_fit_and_gaussians_add_up():
     capture = rooms(wall=False)
     options = replace(OPTIONS, densify_every=90, densify_from=240, reset_every=600)
@@ -182,10 +203,11 @@ def test_each_view_counts_as_in_one_fit_and_gaussians_add_up():
 def test_minutes_add_up():
     cut = cut_capture(rooms(wall=False), 3, options=FitOptions(minutes=5.0))
     minutes = [block.options.minutes for block in cut.blocks]
-    assert sum(minutes) == pytest.approx(5.0)
+    assert sum(minutes) == pytest.approx(0.75 * 5.0), "the rest is the refinement's"
     views = [len(block.capture.views) for block in cut.blocks]
-    assert minutes == pytest.approx([5 * own / sum(views) for own in views])
+    assert minutes == pytest.approx([3.75 * own / sum(views) for own in views])
     assert all(block.options.steps is None for block in cut.blocks)
+    assert cut_capture(rooms(), 1, options=FitOptions(minutes=5.0)).blocks[0].options.minutes == 5.0
 
 
 def test_every_block_has_a_step():
@@ -283,19 +305,94 @@ def test_one_block_is_a_fit(capture: Capture):
     assert blocks.views == capture.views
 
 
-def test_of_each_block_the_gaussians_of_its_cell_are_joined(capture: Capture):
-    cut = cut_capture(capture, 2, options=SHORT)
+def parts_of(cut: CaptureBlocks) -> list[Gaussians]:
+    """What each block keeps of a fit by itself."""
     parts = []
     for block in cut.blocks:
         alone = fit(block.capture, options=block.options).gaussians
         own = alone[cut.cells.cell_of(alone.means) == block.index]
         assert 0 < len(own) < len(alone)
         parts.append(own)
-    joined = fit_blocks(cut)
-    assert same(joined.gaussians, Gaussians.concatenate(parts))
-    assert joined.steps == sum(block.options.steps for block in cut.blocks)
+    return parts
+
+
+def test_of_each_block_the_gaussians_of_its_cell_are_joined_and_refined(capture: Capture):
+    cut = cut_capture(capture, 2, options=SHORT)
+    joined = Gaussians.concatenate(parts_of(cut))
+    shared = BlockFits(cells=cut.cells, joined=joined)
+    steps = [refined_steps(block, block.options.steps) for block in cut.blocks]
+    refined = [
+        refine_block(shared, block, steps=count)
+        for block, count in zip(cut.blocks, steps, strict=True)
+    ]
+    found = fit_blocks(cut)
+    assert same(found.gaussians, Gaussians.concatenate(refined))
+    assert len(found.gaussians) == len(joined)
+    assert not same(found.gaussians, joined)
+    fits = sum(block.options.steps for block in cut.blocks)
+    assert found.steps == fits + sum(steps)
     views = ", ".join(str(len(block.capture.views)) for block in cut.blocks)
-    assert joined.notes == (f"2 blocks of {views} training views were fitted and joined.",)
+    assert found.notes == (
+        f"2 blocks of {views} training views were fitted and joined.",
+        f"They were refined among their neighbours in {sum(steps)} steps.",
+    )
+
+
+def test_a_refinement_has_a_fifth_of_the_steps_and_each_view_as_many():
+    block = cut_capture(rooms(wall=False), 2, options=OPTIONS).blocks[0]
+    three = replace(block, border_views=block.capture.views[:3])
+    assert len(block.capture.views) == 4
+    assert refined_steps(three, 1000) == 150
+    assert refined_steps(replace(block, border_views=block.capture.views), 1000) == 200
+    assert refined_steps(block, 1) == 1
+
+
+def test_refined_blocks_show_their_photographs_better(capture: Capture):
+    """What the neighbours show is taken as they have it, and no longer as the block had it."""
+    options = replace(SHORT, steps=200, max_gaussians=400)
+    cut = cut_capture(capture, 2, options=options)
+
+    def quality(gaussians: Gaussians) -> float:
+        field = GaussianField(gaussians)
+        return float(np.mean([psnr(*render_and_photograph(field, v)) for v in capture.train_views]))
+
+    joined = quality(Gaussians.concatenate(parts_of(cut)))
+    assert quality(fit_blocks(cut).gaussians) > joined + 0.1
+
+
+def test_a_block_is_not_refined_before_all_are_joined(capture: Capture):
+    cut = cut_capture(capture, 2, options=SHORT)
+    with pytest.raises(ValueError, match="^joined: expected the Gaussians of all blocks"):
+        refine_block(BlockFits(cells=cut.cells), cut.blocks[0], steps=1)
+
+
+def test_a_refinement_that_was_stopped_begins_again_and_fits_do_not(
+    capture: Capture, tmp_path: Path
+):
+    cut = cut_capture(capture, 2, options=SHORT)
+    heard: list[tuple[int, float]] = []
+
+    def stop(index: int, done: float) -> None:
+        heard.append((index, done))
+        if index == 1:
+            raise KeyboardInterrupt
+
+    checkpoints = Checkpoints(path=tmp_path / "blocks", steps=1000)
+    told = "^2 of 2 blocks are fitted, but not refined; `resume` goes on from there$"
+    with pytest.raises(KeyboardInterrupt, match=told):
+        fit_blocks(cut, refining=stop, checkpoints=checkpoints)
+    first = refined_steps(cut.blocks[0], cut.blocks[0].options.steps)
+    assert [done for index, done in heard if index == 0] == [
+        (step + 1) / first for step in range(first)
+    ]
+    steps: list[int] = []
+    going_on = fit_blocks(
+        cut,
+        progress=lambda index, status: steps.append(index),
+        checkpoints=replace(checkpoints, resume=True),
+    )
+    assert steps == []
+    assert same(going_on.gaussians, fit_blocks(cut).gaussians)
 
 
 def result(opacities: list[float], **more) -> FitResult:
@@ -373,15 +470,51 @@ def test_a_block_alone_is_one_of_all(capture: Capture, tmp_path: Path):
     shared = BlockFits(cells=cut.cells, checkpoints=Checkpoints(path=tmp_path / "kept", steps=1000))
     results = [fit_block(shared, block) for block in reversed(cut.blocks)]
     assert block_checkpoint(tmp_path / "kept", 1, 2).is_file()
-    assert same(join_blocks(cut, results[::-1]).gaussians, fit_blocks(cut).gaussians)
+    joined = join_blocks(cut, results[::-1])
+    sharing = replace(shared, joined=joined.gaussians)
+    again = [
+        refine_block(sharing, block, steps=refined_steps(block, one.steps))
+        for block, one in zip(cut.blocks, results[::-1], strict=True)
+    ]
+    assert same(Gaussians.concatenate(again), fit_blocks(cut).gaussians)
+
+
+class Objects:
+    """Evidence that is told what it is asked, and adds nothing to a loss."""
+
+    digest = "none"
+
+    def __init__(self, told: list[str]) -> None:
+        self.told = told
+
+    def decide(self, gaussians: Gaussians, *, room: int) -> Edited:
+        self.told.append(f"decide {room > 0}")
+        return Edited(gaussians=gaussians, rows=torch.arange(len(gaussians)))
+
+    def loss(self, generator: torch.Generator):
+        self.told.append("loss")
+        return lambda view, gaussians, rows: gaussians.means.sum() * 0
+
+    def state(self) -> dict[str, torch.Tensor]:
+        return {}
+
+    def restore(self, tensors: dict[str, torch.Tensor]) -> None:
+        pass
 
 
 def test_evidence_of_objects_is_asked_for_the_views_of_a_block(capture: Capture):
     asked: list[tuple[str, ...]] = []
+    told: list[str] = []
 
-    def objects(of: Capture):
+    def objects(of: Capture) -> Objects:
         asked.append(tuple(view.name for view in of.views))
+        told.append("block")
+        return Objects(told)
 
     cut = cut_capture(capture, 2, options=SHORT)
     fit_blocks(cut, objects=objects)
-    assert asked == [tuple(v.name for v in block.capture.views) for block in cut.blocks]
+    fitted = [tuple(v.name for v in block.capture.views) for block in cut.blocks]
+    assert asked == [*fitted, *(tuple(v.name for v in b.border_views) for b in cut.blocks)]
+    last = len(told) - 1 - told[::-1].index("block")
+    steps = refined_steps(cut.blocks[1], cut.blocks[1].options.steps)
+    assert told[last:] == ["block", "decide False", *["loss"] * steps], "nothing is split"

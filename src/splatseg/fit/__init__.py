@@ -6,6 +6,7 @@ photographs and from any other differentiable loss.
 
 from splatseg.core.checkpoints import Checkpoints as Checkpoints
 from splatseg.fit._adding import added_gaussians as added_gaussians
+from splatseg.fit._block_fits import fit_blocks as fit_blocks
 from splatseg.fit._checkpoint import CheckpointSummary as CheckpointSummary
 from splatseg.fit._checkpoint import checkpoint_gaussians as checkpoint_gaussians
 from splatseg.fit._checkpoint import checkpoint_summary as checkpoint_summary
@@ -33,7 +34,6 @@ from splatseg.fit.blocks import CaptureBlock as CaptureBlock
 from splatseg.fit.blocks import CaptureBlocks as CaptureBlocks
 from splatseg.fit.blocks import Cells as Cells
 from splatseg.fit.blocks import cut_capture as cut_capture
-from splatseg.fit.blocks import fit_blocks as fit_blocks
 from splatseg.fit.depth import SCAN_SPACING as SCAN_SPACING
 from splatseg.fit.depth import DepthPoints as DepthPoints
 from splatseg.fit.depth import aligned_inverse as aligned_inverse

@@ -117,10 +117,10 @@ def block_files(root: Path) -> tuple[Path, ...]:
 
 
 def where_blocks_stopped(root: Path) -> str | None:
-    """Where a fit in blocks was stopped, in words; None if all are finished."""
+    """Where a fit in blocks was stopped, in words; None if it was finished."""
     count, progress = blocks_progress(root)
     if progress >= count:
-        return None
+        return None if is_scene(root) else f"was stopped at the refinement of its {count} blocks"
     done = 100 * progress / count
     return f"was stopped at block {int(progress) + 1} of {count} ({done:.0f} %)"
 

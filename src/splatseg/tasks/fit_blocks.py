@@ -86,10 +86,14 @@ def fitted(
         backend=backend,
         executor=executor,
         progress=partial(progress.of_block, count=len(data)),
+        refining=partial(progress.of_refinement, count=len(data)),
         checkpoints=checkpoints,
         objects=objects,
     )
 
+
+_FITS = 0.8
+"""Part of the progress that is that of the fits of blocks; the rest is their refinement's."""
 
 # Weight of the newest view in the figures that are told; views differ much.
 _SMOOTHING = 0.02
@@ -109,7 +113,14 @@ class FitSteps:
     def of_block(self, index: int, now: FitProgress, *, count: int) -> None:
         """Of one step of a block, of so many that follow each other."""
         done = (index + now.progress) / count
+        if count > 1:
+            done *= _FITS
         self(replace(now, progress=done), where=f"block {index + 1} of {count}, ")
+
+    def of_refinement(self, index: int, done: float, *, count: int) -> None:
+        """Of one step of a block's refinement, of which so much is done."""
+        part = _FITS + (1 - _FITS) * (index + done) / count
+        self._step(round(1000 * part), 1000, f"block {index + 1} of {count} among its neighbours")
 
     def __call__(self, now: FitProgress, *, where: str = "") -> None:
         """Of one step."""
