@@ -1,6 +1,7 @@
 """Gaussians in chunks on the disk: what is written comes back, and what is damaged is told."""
 
 import json
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from splatseg.core.chunks import morton_order
 from splatseg.core.coarser import coarser
 from splatseg.errors import FileFormatError, InputError, MissingFileError, RangeError
 from splatseg.io import chunks as files
-from splatseg.io.chunks import ChunkWriter, level_folder, open_chunks, write_chunks
+from splatseg.io.chunks import ChunkWriter, level_folder, level_rows, open_chunks, write_chunks
 from support.chunked import in_chunks, in_memory
 
 COLUMNS = ("means", "rotations", "scales", "opacities", "sh")
@@ -156,6 +157,41 @@ def test_coarser_levels_keep_the_largest(rng, tmp_path, monkeypatch) -> None:
     wanted = coarser(first)
     for name in ("means", "rotations", "scales", "opacities"):
         assert torch.equal(getattr(in_memory(levels[1])[10:11], name), getattr(wanted, name))
+
+
+def test_a_row_of_a_level_stands_for_the_heaviest_of_its_run(rng, tmp_path, monkeypatch) -> None:
+    gaussians = some(rng, 640)
+    monkeypatch.setattr(files, "CHUNK_ROWS", 100)
+    write_chunks(lambda a, b: gaussians[a:b], 640, tmp_path, memory=10**9, levels=2)
+    assert level_rows(tmp_path, 0).tolist() == list(range(640))
+    first, second = (level_rows(tmp_path, level) for level in (1, 2))
+    assert first[:10].tolist() == list(range(10)), "who stands apart stays"
+    whole = in_memory(open_chunks(tmp_path, memory=1))
+    weights = whole.opacities * whole.scales.sort(dim=1).values[:, 1:].prod(dim=1)
+    below, row = list(range(10, 640)), 10
+    while below:  # runs of four within chunks of a hundred
+        run = below[: min(4, 100 - (below[0] - 10) % 100)]
+        assert first[row] == max(run, key=lambda one: float(weights[one]))
+        below, row = below[len(run) :], row + 1
+    assert row == len(first)
+    # Of the next level it is one of those that the level below has.
+    assert len(second) == len(open_chunks(level_folder(tmp_path, 2), memory=1))
+    assert set(second.tolist()) < set(first.tolist())
+
+
+def test_a_level_of_other_chunks_is_refused(rng, tmp_path, monkeypatch) -> None:
+    gaussians = some(rng, 640)
+    monkeypatch.setattr(files, "CHUNK_ROWS", 100)
+    write_chunks(lambda a, b: gaussians[a:b], 640, tmp_path, memory=10**9, levels=1)
+    other = tmp_path / "other"
+    other.mkdir()
+    write_chunks(lambda a, b: gaussians[a : min(b, 400)], 400, other, memory=10**9, levels=1)
+    shutil.rmtree(level_folder(tmp_path, 1))
+    shutil.copytree(level_folder(other, 1), level_folder(tmp_path, 1))
+    with pytest.raises(FileFormatError, match="the chunks of level 0, coarser, got others"):
+        level_rows(tmp_path, 1)
+    with pytest.raises(MissingFileError):
+        level_rows(other, 2)
 
 
 def test_the_source_must_be_renderable_and_not_empty(gaussians, tmp_path) -> None:

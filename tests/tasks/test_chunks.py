@@ -32,6 +32,7 @@ from splatseg.tasks import (
     edit_chunks,
     edit_scene,
     export_scene,
+    level_within,
     render_views,
     see,
     segment,
@@ -152,6 +153,37 @@ def test_evidence_of_the_scene_comes_along(whole, tmp_path) -> None:
     assert (tmp_path / "back" / "evidence" / "mine" / "a.txt").read_text() == "a"
 
 
+def test_a_level_is_a_scene_with_layers(whole, tmp_path, monkeypatch) -> None:
+    """A Gaussian has the labels of the one of all that it stands for."""
+    monkeypatch.setattr(files, "CHUNK_ROWS", 128)
+    made = chunk_scene(whole, tmp_path / "city", options=ChunkOptions(levels=2), memory=MEMORY)
+    options = ChunkOptions(whole=True, level=2)
+    level = chunk_scene(made.folder, tmp_path / "level", options=options, memory=MEMORY)
+    assert level.layers == ("classes", "objects")
+    assert level.chunks == 0
+    assert level.gaussians < made.gaussians / 10
+    scene = load_scene(level.folder)
+    assert len(scene.gaussians) == level.gaussians
+    rows = files.level_rows(made.folder / "gaussians", 2)
+    everything = load_scene(made.folder, memory=MEMORY)
+    assert torch.equal(scene.layers["classes"].ids, everything.layers["classes"].ids[rows])
+    objects = scene.layers["objects"]
+    assert isinstance(objects, InstanceTree)
+    assert torch.equal(objects.labels.ids, everything.layers["objects"].labels.ids[rows])
+    options = ChunkOptions(whole=True, level=3)
+    with pytest.raises(InputError, match="level: expected one that"):
+        chunk_scene(made.folder, tmp_path / "none", options=options, memory=MEMORY)
+    assert not (tmp_path / "none").exists()
+    # The finest level that is small enough.
+    counts = [made.gaussians, len(files.level_rows(made.folder / "gaussians", 1)), level.gaussians]
+    for number, count in enumerate(counts):
+        assert level_within(made.folder, count) == number
+        if number < 2:
+            assert level_within(made.folder, count - 1) == number + 1
+    with pytest.raises(InputError, match=f"got 2 coarser ones, the last of {counts[2]}; `splatse"):
+        level_within(made.folder, counts[2] - 1)
+
+
 def test_which_way_is_told(whole, chunked, tmp_path) -> None:
     with pytest.raises(InputError, match="is in chunks already; --whole"):
         chunk_scene(chunked.root, tmp_path / "made", memory=MEMORY)
@@ -160,6 +192,8 @@ def test_which_way_is_told(whole, chunked, tmp_path) -> None:
     for given in ({"levels": 1}, {"harmonics": "float16"}):
         with pytest.raises(InputError, match="whole: takes no"):
             ChunkOptions(whole=True, **given)
+    with pytest.raises(InputError, match="level: goes with `whole`"):
+        ChunkOptions(level=1)
     with pytest.raises(InputError, match="expected a new folder"):
         chunk_scene(whole, whole, memory=MEMORY)
     assert not (tmp_path / "made").exists()

@@ -17,12 +17,15 @@ import pytest
 import torch
 
 import splatseg
+from splatseg.cli import view
 from splatseg.core import Gaussians
 from splatseg.fit import checkpoint_gaussians
 from splatseg.fit._checkpoint import FitState, write_checkpoint
+from splatseg.io.chunks import CHUNKS_FOLDER, level_rows
 from splatseg.io.scene import load_scene
 from splatseg.io.scene_folder import CHECKPOINT_FILE
 from splatseg.io.splats import write_splats
+from splatseg.tasks import ChunkOptions, chunk_scene
 from splatseg.viewer import _fitting
 from splatseg.viewer._server import ViewServer
 from support.forked import Forked
@@ -114,6 +117,33 @@ def test_the_stage_that_the_page_begins_with(things, run, monkeypatch, words, st
 
     meanwhile(monkeypatch, look)
     assert run("view", things, "--no-open", "--quiet", *words)[0] == 0
+
+
+def test_a_level_of_a_scene_in_chunks_is_opened_with_its_layers(
+    things, tmp_path, run, monkeypatch
+) -> None:
+    city = tmp_path / "city"
+    chunk_scene(things, city, options=ChunkOptions(levels=1))
+    rows = level_rows(city / CHUNKS_FOLDER, 1)
+    monkeypatch.setattr(view, "_MOST", 3 * EACH - 1)
+
+    def look(page: Page) -> None:
+        state = page.heard[0]
+        assert state["scene"]["count"] == len(rows) < 3 * EACH
+        assert 0 < page.select(1, points=[RED_PIXEL])["count"] < len(rows)
+
+    meanwhile(monkeypatch, look)
+    status, _, errors = run("view", city, "--output", tmp_path / "level", "--no-open")
+    assert status == 0
+    assert f"level 1 of it is opened, {len(rows)} Gaussians" in errors
+    layers = set(load_scene(things).layers)
+    assert layers
+    assert set(load_scene(tmp_path / "level").layers) == layers
+    assert run("view", city, "--no-open", "--quiet")[0] == 0, "in a temporary folder"
+    monkeypatch.setattr(view, "_MOST", 1)
+    status, _, errors = run("view", city, "--no-open")
+    assert status == 2
+    assert "expected a level of at most 1 Gaussians, got 1 coarser ones" in errors
 
 
 @pytest.fixture

@@ -22,7 +22,7 @@ class Command(Printing):
     the scene's own evidence come along, and SCENE stays as it is.
 
     SCENE is a scene folder or a binary PLY file, which may be larger than memory; a PLY file gets
-    the views of --data, or none. --whole goes the other way.
+    the views of --data, or none. --whole goes the other way, with --level to a smaller scene.
 
     For example:
 
@@ -31,6 +31,8 @@ class Command(Printing):
     splatseg chunks city.ply --data capture -o city-chunks --harmonics float16 --memory 4GB
 
     splatseg chunks city-chunks -o city-whole --whole
+
+    splatseg chunks city-chunks -o city-small --whole --level 1
     """
 
     scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]

@@ -19,18 +19,23 @@ from splatseg.core import Capture
 from splatseg.errors import InputError, MissingFileError
 from splatseg.io.atomic import check_writable
 from splatseg.io.captures import read_capture
+from splatseg.io.chunks import CHUNKS_FOLDER, is_in_chunks
 from splatseg.io.scene import load_scene
 from splatseg.io.scene_folder import is_scene, is_unfinished
-from splatseg.tasks import import_scene
+from splatseg.tasks import ChunkOptions, chunk_scene, import_scene, level_within
 from splatseg.viewer.serving import FittingScene, FittingWatch, ViewServer, Worker, opener
+
+_MOST = 2_000_000
+"""Gaussians of a level that is opened of a scene in chunks: more are not drawn while one looks."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Command(Printing):
     """Open a scene in the browser: look, select by clicks, name objects, export them.
 
-    SCENE may also be a splat file, which is imported first, and the folder of a fit that is still
-    running: the picture improves with each checkpoint. What is made is kept in SCENE/view and is
+    SCENE may also be a splat file, which is imported first; a scene in chunks, of which a coarser
+    level is opened, with its layers; and the folder of a fit that is still running: the picture
+    improves with each checkpoint. What is made is kept in SCENE/view and is
     there again at the next start. Ctrl-C ends the server.
 
     The link that is printed holds a secret: whoever has it, and reaches the address, can look at
@@ -46,12 +51,12 @@ class Command(Printing):
     """
 
     scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
-    """Scene folder, splat file (PLY, compressed PLY, .splat, SPZ, SOG, glTF), or folder of a fit
-    that is still running."""
+    """Scene folder, in chunks or not, splat file (PLY, compressed PLY, .splat, SPZ, SOG, glTF), or
+    folder of a fit that is still running."""
 
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="NEW")] = None
-    """Scene folder to write, of a splat file. It must not exist yet. None takes a temporary one,
-    which is removed at the end."""
+    """Scene folder to write, of a splat file or a level of chunks. It must not exist yet. None
+    takes a temporary one, which is removed at the end."""
 
     data: Data = None
 
@@ -94,8 +99,10 @@ def run(command: Command) -> None:
 @contextmanager
 def _served(command: Command) -> Generator[ViewServer]:
     """A server that runs, within the block."""
-    if command.output is not None and not command.scene.is_file():
-        raise InputError("output: goes with a splat file, which is imported into it.")
+    if command.output is not None and not (command.scene.is_file() or _in_chunks(command.scene)):
+        raise InputError(
+            "output: goes with a splat file, which is imported into it, or a scene in chunks."
+        )
     if not _is_loopback(command.host):
         command.observer.note(
             f"whoever has the link and reaches {command.host} can look at the scene and change "
@@ -123,11 +130,11 @@ def _served(command: Command) -> Generator[ViewServer]:
 
 @contextmanager
 def _scene_folder(command: Command) -> Generator[Path]:
-    """The scene's folder; of a splat file, one that it was imported into."""
+    """The scene's folder; of a splat file or a scene in chunks, one that it was written into."""
     path = command.scene
     if not path.exists():
         raise MissingFileError(f"{path}: there is no such scene, file or folder.")
-    if not path.is_file():
+    if not path.is_file() and not _in_chunks(path):
         if not is_scene(path):
             raise InputError(
                 f"{path}: expected a scene folder, got none (no scene.json); `splatseg fit` makes "
@@ -142,17 +149,40 @@ def _scene_folder(command: Command) -> Generator[Path]:
                 f"output: expected a new folder, got the scene {command.output}; open it with "
                 f"splatseg view {command.output}."
             )
-        import_scene(path, command.output, backend=command.backend, observer=command.observer)
+        _written(command, command.output)
         yield command.output
         return
     with tempfile.TemporaryDirectory(prefix="splatseg-view-") as temporary:
-        folder = Path(temporary) / path.name.partition(".")[0]
-        import_scene(path, folder, backend=command.backend, observer=command.observer)
+        folder = Path(temporary) / path.resolve().name.partition(".")[0]
+        _written(command, folder)
         command.observer.note(
             "the scene is in a temporary folder and goes with all that is made of it; "
             "--output keeps it"
         )
         yield folder
+
+
+def _written(command: Command, folder: Path) -> None:
+    """Write the scene of a splat file, or of a level of a scene in chunks."""
+    if command.scene.is_file():
+        import_scene(command.scene, folder, backend=command.backend, observer=command.observer)
+        return
+    level = level_within(command.scene, _MOST)
+    made = chunk_scene(
+        command.scene,
+        folder,
+        options=ChunkOptions(whole=True, level=level),
+        data=command.data,
+        observer=command.observer,
+    )
+    command.observer.note(
+        f"{command.scene} is in chunks: level {level} of it is opened, {made.gaussians} Gaussians; "
+        "what is selected and exported is of these"
+    )
+
+
+def _in_chunks(path: Path) -> bool:
+    return is_in_chunks(path / CHUNKS_FOLDER)
 
 
 def _capture(command: Command) -> Capture | None:

@@ -17,7 +17,7 @@ References:
 """
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 from splatseg.core.boundary import boundary
@@ -56,7 +56,7 @@ def coarser(gaussians: Gaussians, *, run: Count = RUN) -> Gaussians:
     group = torch.arange(len(gaussians)) // run
     count = -(-len(gaussians) // run)
     scales = gaussians.scales.double()
-    weight = (gaussians.opacities.double() * _area(scales)).clamp_min(_LEAST)
+    weight = _weights(gaussians)
     total = torch.zeros(count, dtype=torch.float64).index_add_(0, group, weight)
 
     def mean(values: Float[Tensor, "n ..."]) -> Float[Tensor, "m ..."]:
@@ -81,6 +81,32 @@ def coarser(gaussians: Gaussians, *, run: Count = RUN) -> Gaussians:
         sh=mean(gaussians.sh).float(),
         extra={},
     )
+
+
+@boundary
+def heaviest(gaussians: Gaussians, *, run: Count = RUN) -> Int64[Tensor, "m"]:
+    """The row of each run that weighs most, of equal ones the first: its label is that of the run.
+
+    Args:
+        gaussians: As for `coarser`.
+        run: Rows of a run.
+
+    Example:
+        >>> three = Gaussians(means=torch.zeros(3, 3), rotations=torch.eye(4)[:1].expand(3, 4),
+        ...                   scales=torch.ones(3, 3), opacities=torch.tensor([0.2, 0.8, 0.1]),
+        ...                   sh=torch.zeros(3, 1, 3))
+        >>> heaviest(three, run=2).tolist()
+        [1, 2]
+    """
+    count = -(-len(gaussians) // run)
+    weights = torch.full((count * run,), -1.0, dtype=torch.float64)
+    weights[: len(gaussians)] = _weights(gaussians)
+    return torch.arange(count) * run + weights.reshape(count, run).argmax(dim=1)
+
+
+def _weights(gaussians: Gaussians) -> Float[Tensor, "n"]:
+    """How much of a picture each Gaussian fills, float64."""
+    return (gaussians.opacities.double() * _area(gaussians.scales.double())).clamp_min(_LEAST)
 
 
 def _area(scales: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:

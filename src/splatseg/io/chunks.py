@@ -32,7 +32,7 @@ from torch import Tensor
 from splatseg.core import Gaussians
 from splatseg.core.boundary import boundary
 from splatseg.core.chunks import Chunks, morton_order
-from splatseg.core.coarser import RUN, coarser
+from splatseg.core.coarser import RUN, coarser, heaviest
 from splatseg.core.gaussians import LOW_PASS
 from splatseg.core.options import Natural
 from splatseg.errors import InputError, MissingFileError
@@ -94,6 +94,42 @@ def level_folder(folder: Path, level: Natural) -> Path:
 def is_in_chunks(folder: Path) -> bool:
     """Whether a folder is one of Gaussians in chunks."""
     return (folder / INDEX_FILE).is_file()
+
+
+@boundary
+def level_rows(folder: Path, level: Natural) -> Int64[Tensor, "m"]:
+    """Which of all Gaussians each one of a level stands for: of a run that which weighs most.
+
+    So a layer of all, at these rows, is one of the level.
+
+    Args:
+        folder: Of Gaussians in chunks.
+        level: One that is there; 0 is all of them.
+
+    Raises:
+        MissingFileError: If a file of it, or of a level below, is not there.
+        FileFormatError: If one is damaged, or has other chunks than the one below.
+    """
+    below = open_chunks(folder, memory=1)
+    rows = torch.arange(len(below))
+    for number in range(1, level + 1):
+        above = open_chunks(level_folder(folder, number), memory=1)
+        if below.chunks is None or above.chunks is None:
+            raise InputError(f"{folder}: expected Gaussians in chunks, got others.")
+        runs = list(pairwise(below.chunks.starts.tolist()))
+        counts = above.chunks.starts.diff().tolist()
+        kept: list[Tensor] = []
+        fits = len(runs) == len(counts)
+        for (first, end), count in zip(runs, counts, strict=False):
+            if count == end - first:  # those that stand apart, or a single one
+                kept.append(torch.arange(first, end))
+            else:
+                kept.append(first + heaviest(below.chunks.read([(first, end)], colours=False)))
+            fits &= len(kept[-1]) == count
+        what = f"the chunks of level {number - 1}, coarser, got others"
+        expect(fits, level_folder(folder, number), what)
+        rows, below = rows[torch.cat(kept)], above
+    return rows
 
 
 @boundary

@@ -5,6 +5,7 @@ from .checkpoints import CheckpointOptions as CheckpointOptions
 from .chunks import ChunkedScene as ChunkedScene
 from .chunks import ChunkOptions as ChunkOptions
 from .chunks import chunk_scene as chunk_scene
+from .chunks import level_within as level_within
 from .demo import Demo as Demo
 from .demo import DemoOptions as DemoOptions
 from .demo import make_demo as make_demo

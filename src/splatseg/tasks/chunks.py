@@ -1,6 +1,6 @@
 """A scene in chunks, which commands stream, of one or a PLY file that is never held; and back."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -14,7 +14,14 @@ from splatseg.core.options import Natural
 from splatseg.core.options import options as options_class
 from splatseg.errors import InputError
 from splatseg.io.captures import read_capture
-from splatseg.io.chunks import CHUNKS_FOLDER, is_in_chunks, open_chunks, write_chunks
+from splatseg.io.chunks import (
+    CHUNKS_FOLDER,
+    is_in_chunks,
+    level_folder,
+    level_rows,
+    open_chunks,
+    write_chunks,
+)
 from splatseg.io.limits import memory_to_use
 from splatseg.io.scene import (
     GaussiansToWrite,
@@ -52,7 +59,13 @@ class ChunkOptions:
     """The other way: SCENE is in chunks, and NEW has its Gaussians in one PLY file, in the order of
     the chunks."""
 
+    level: Natural = 0
+    """With `whole`: that coarser level as a scene of its own, such as one that the browser opens.
+    Each of its Gaussians has the labels of the one of all that it most stands for. 0 is all."""
+
     def __post_init__(self) -> None:
+        if self.level and not self.whole:
+            raise InputError("level: goes with `whole`; `levels` says how many to write.")
         if self.whole and (self.levels or self.harmonics != "float32"):
             raise InputError("whole: takes no `harmonics` and no `levels`.")
 
@@ -105,7 +118,7 @@ def chunk_scene(
     if options.whole:
         if not chunked:
             raise InputError(f"{source}: expected a scene in chunks with whole, got another.")
-        return _whole(source, folder, data=data, memory=memory)
+        return _whole(source, folder, level=options.level, data=data, memory=memory)
     if chunked:
         raise InputError(f"{source}: is in chunks already; --whole is the way back.")
     there = is_scene(source)
@@ -149,11 +162,37 @@ def chunk_scene(
     )
 
 
-def _whole(source: Path, folder: Path, *, data: Path | None, memory: int) -> ChunkedScene:
-    scene = load_scene(source, data=data, memory=memory)
-    save_scene(scene, folder, layers=scene.layers, evidence=_own_evidence(source))
+def _whole(
+    source: Path, folder: Path, *, level: int, data: Path | None, memory: int
+) -> ChunkedScene:
+    scene = load_scene(source, data=data, memory=memory, level=level)
+    layers: Mapping[str, Layer] = scene.layers
+    if level:
+        rows = level_rows(source / CHUNKS_FOLDER, level)
+        edited = Edited(gaussians=scene.gaussians, rows=rows)
+        layers = {name: apply_rows(layer, edited) for name, layer in layers.items()}
+    save_scene(scene, folder, layers=layers, evidence=_own_evidence(source))
     count = len(scene.gaussians)
-    return ChunkedScene(folder=folder, gaussians=count, chunks=0, layers=tuple(scene.layers))
+    return ChunkedScene(folder=folder, gaussians=count, chunks=0, layers=tuple(layers))
+
+
+@boundary
+def level_within(source: Path, most: int) -> int:
+    """The finest level of a scene in chunks that has at most so many Gaussians.
+
+    Raises:
+        InputError: If all that it has are larger.
+    """
+    folder, level, count = source / CHUNKS_FOLDER, 0, 0
+    while is_in_chunks(level_folder(folder, level)):
+        count = len(open_chunks(level_folder(folder, level), memory=1))
+        if count <= most:
+            return level
+        level += 1
+    raise InputError(
+        f"{source}: expected a level of at most {most} Gaussians, got {level - 1} coarser ones, "
+        f"the last of {count}; `splatseg chunks --levels` makes more."
+    )
 
 
 def _own_evidence(source: Path) -> tuple[Path, ...]:
