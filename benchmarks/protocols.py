@@ -28,8 +28,9 @@ from splatseg.methods import find_method  # noqa: E402
 from splatseg_bench.layouts import read_benchmark  # noqa: E402
 from splatseg_bench.options import BenchOptions  # noqa: E402
 from splatseg_bench.results import load_result  # noqa: E402
-from splatseg_bench.run import bench, write_tables  # noqa: E402
+from splatseg_bench.run import bench  # noqa: E402
 from splatseg_bench.scene import BenchmarkScene  # noqa: E402
+from splatseg_bench.tables import write_tables  # noqa: E402
 from support.benchmark_layouts import read_source, write_layout  # noqa: E402
 from support.benchmark_layouts.evidence import write_evidence  # noqa: E402
 

@@ -10,11 +10,12 @@ import torch
 from splatseg.cli import main
 from splatseg.errors import InputError
 from splatseg.fit import FitOptions
-from splatseg.fit._block_fits import BlockFits, refined_steps
+from splatseg.fit._block_fits import refined_steps
 from splatseg.io.captures import read_capture
 from splatseg.io.scene import load_scene
 from splatseg.io.scene_folder import BLOCKS_FOLDER, CHECKPOINT_FILE, is_scene, is_unfinished
 from splatseg.tasks import MakeSceneOptions, describe, fit_capture
+from support.elsewhere import Elsewhere
 from support.observers import Cancelled, Stopping
 
 FIT = FitOptions(minutes=None, steps=40, max_gaussians=600, seed=4)
@@ -191,29 +192,11 @@ def test_the_command_line(small_room, straight, tmp_path, capsys):
         assert not (tmp_path / "wrong").exists()
 
 
-class Elsewhere:
-    """Sends what it is given as another process gets it, and works on it here."""
-
-    def __init__(self) -> None:
-        self.sent: list[BlockFits] = []
-        self.pickle = pytest.importorskip(
-            "ray.cloudpickle", reason="the extra ray is not installed"
-        )
-
-    def again(self, value):
-        return self.pickle.loads(self.pickle.dumps(value))
-
-    def map(self, function, items, *, shared):
-        self.sent.append(self.again(shared))
-        for item in items:
-            yield from function(self.sent[-1], self.again(item))
-
-
 def test_blocks_that_are_fitted_elsewhere_have_the_same_bytes(small_room, straight, tmp_path):
     folder, executor, told = tmp_path / "scene", Elsewhere(), Stopping()
     made_of(small_room, folder, executor=executor, observer=told)
     assert gaussians(folder) == gaussians(straight)
-    shared, refining = executor.sent
+    shared, refining = executor.shared
     assert shared.progress is shared.refining is refining.refining is None
     assert shared.joined is None
     assert refining.joined is not None

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from splatseg.core import Gaussians, Labels, LayerInfo, PointLabels, ScanSource, Scene
+from splatseg.core import Executor, Gaussians, Labels, LayerInfo, PointLabels, ScanSource, Scene
 from splatseg.errors import InputError
 from splatseg.io.captures import read_capture
 from splatseg.io.scans import read_scans
@@ -17,6 +17,7 @@ from splatseg.street.field import MeshField
 from splatseg.tasks import ScanLabelOptions, label_scans, viewed_points
 from support.analytic import BALL, FLOOR, BallOverFloor
 from support.arrays import arrays_of
+from support.elsewhere import Elsewhere
 from support.mesh_fields import balls, told_field
 from support.ply import write_ply
 
@@ -36,7 +37,9 @@ class Halves(BallOverFloor):
 class AtOnce(Halves):
     """One that labels many scans in a way of its own."""
 
-    def labels_of_scans(self, scans: ScanSource, layer: str) -> Iterator[tuple[str, PointLabels]]:
+    def labels_of_scans(
+        self, scans: ScanSource, layer: str, *, executor: Executor
+    ) -> Iterator[tuple[str, PointLabels]]:
         for name in scans.scan_names:
             count = len(scans.scan(name))
             yield name, PointLabels(ids=torch.full((count,), 3), confidence=torch.ones(count))
@@ -126,6 +129,30 @@ def test_labels_say_which_vertices_were_asked(scene, generated_drive, tmp_path) 
 def test_a_field_may_label_all_scans_in_its_own_way(scene, generated_drive, tmp_path) -> None:
     made = label_scans(scene, generated_drive, tmp_path / "out", field=AtOnce())
     assert made.counts.ids == {3: made.counts.points}
+
+
+@pytest.mark.parametrize("by", ["gaussians", "mesh", "vertices"])
+def test_scans_that_are_labelled_elsewhere_have_the_same_bytes(
+    labelled, generated_drive, tmp_path, by
+) -> None:
+    scene, layer = labelled
+    given: dict[str, object] = {"backend": "cpu"}
+    if by == "gaussians":
+        given |= {"layers": {"classes": layer}, "points": ViewedPointOptions(window=1)}
+    else:
+        points = read_scans(generated_drive).scan("0001").points
+        field = told_field(balls([points[0].tolist()], radius=0.3), [0])
+        options = ViewedPointOptions(window=1)
+        given["field"] = field if by == "vertices" else viewed_points(scene, field, options=options)
+    label_scans(scene, generated_drive, tmp_path / "here", **given)
+    executor = Elsewhere()
+    label_scans(scene, generated_drive, tmp_path / "there", executor=executor, **given)
+    scans = list(read_scans(generated_drive).scan_names)
+    # Windows are asked twice, once for what shapes are learnt from.
+    numbers = list(range(len(scans)))
+    assert executor.items == (scans if by == "vertices" else numbers * 2)
+    for name in ("labels.npz", "labels.json"):
+        assert (tmp_path / "here" / name).read_bytes() == (tmp_path / "there" / name).read_bytes()
 
 
 def test_gaussians_label_points_by_what_views_show(labelled, generated_drive, tmp_path) -> None:

@@ -12,11 +12,11 @@ from .results import check_comparable as check_comparable
 from .results import load_result as load_result
 from .run import BenchRun as BenchRun
 from .run import bench as bench
-from .run import bench_table as bench_table
-from .run import write_tables as write_tables
 from .scene import BenchmarkScene as BenchmarkScene
 from .scene import Scribble as Scribble
 from .scene import TargetTask as TargetTask
 from .scene import TrueMaps as TrueMaps
 from .scene import TrueMask as TrueMask
 from .scene import TruePoints as TruePoints
+from .tables import bench_table as bench_table
+from .tables import write_tables as write_tables

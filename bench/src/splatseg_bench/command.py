@@ -1,7 +1,7 @@
 """``splatseg bench``: methods under a published protocol, with the published figures beside."""
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
@@ -21,9 +21,11 @@ from splatseg.cli._shared import (
 )
 from splatseg.cli._words import listed
 from splatseg.fit import Preset
+from splatseg.tasks import ExecutorOptions, open_executor
 from splatseg_bench.options import BenchOptions
 from splatseg_bench.protocols import PROTOCOLS
-from splatseg_bench.run import BenchRun, bench, bench_table, write_tables
+from splatseg_bench.run import BenchRun, bench
+from splatseg_bench.tables import bench_table, write_tables
 
 _DEFAULT = BenchOptions()
 
@@ -118,6 +120,10 @@ class Command:
 
     seed: Seed = 0
     backend: Backend = "auto"
+
+    executing: tyro.conf.OmitArgPrefixes[ExecutorOptions] = field(default_factory=ExecutorOptions)
+    """Where scenes are fitted and measured."""
+
     json: Json = False
     quiet: Quiet = False
 
@@ -130,34 +136,37 @@ Command.__doc__ = f"{Command.__doc__}\n\nProtocols:\n\n" + "\n".join(
 def run(command: Command) -> None:
     """Run a protocol and print its table."""
     words = typed(sys.argv)
-    done = bench(
-        command.protocol,
-        command.data,
-        command.output,
-        options=BenchOptions(
-            methods=listed("--method", command.method),
-            models=command.model,
-            method_options=command.option,
-            companions=command.companion,
-            prompter=command.prompter,
-            grounder=command.grounder,
-            scenes=listed("--scenes", command.scenes) if command.scenes else (),
-            fitted=command.fitted,
-            preset=command.preset,
-            steps=command.steps,
-            max_gaussians=command.max_gaussians,
-            switches=command.switch,
-            published=command.published,
-            beside=command.beside,
-            seed=command.seed,
-            again=command.again,
-            download=command.download,
-            device=command.device,
-        ),
-        backend=command.backend,
-        command=words,
-        observer=ConsoleObserver(quiet=command.quiet, json=command.json),
-    )
+    observer = ConsoleObserver(quiet=command.quiet, json=command.json)
+    with open_executor(command.executing, observer=observer) as executor:
+        done = bench(
+            command.protocol,
+            command.data,
+            command.output,
+            options=BenchOptions(
+                methods=listed("--method", command.method),
+                models=command.model,
+                method_options=command.option,
+                companions=command.companion,
+                prompter=command.prompter,
+                grounder=command.grounder,
+                scenes=listed("--scenes", command.scenes) if command.scenes else (),
+                fitted=command.fitted,
+                preset=command.preset,
+                steps=command.steps,
+                max_gaussians=command.max_gaussians,
+                switches=command.switch,
+                published=command.published,
+                beside=command.beside,
+                seed=command.seed,
+                again=command.again,
+                download=command.download,
+                device=command.device,
+            ),
+            backend=command.backend,
+            command=words,
+            executor=executor,
+            observer=observer,
+        )
     paths = write_tables(done, command.output, command=words)
     if command.json:
         print_result(_facts(done, paths), [], json=True)

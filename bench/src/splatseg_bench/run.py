@@ -2,22 +2,20 @@
 
 import importlib.metadata
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from splatseg.core import Model
+from splatseg.core import LOCAL, Executor, Model
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.json_values import plain_object
 from splatseg.core.models import GroundedMasks
 from splatseg.errors import InputError
-from splatseg.io.atomic import atomic_file, named_write_failures, path_inside
-from splatseg.io.json_files import write_json
+from splatseg.io.atomic import named_write_failures, path_inside
 from splatseg.methods import find_method
 from splatseg.render import BackendName
-from splatseg.report.html import Commands, Notice, Report, Table, report_html
-from splatseg.tasks.figures import Cell, write_table
 from splatseg.tasks.work import SILENT, Observer, check_parent_writable
 from splatseg_bench.evidence import (
     bench_model,
@@ -30,16 +28,13 @@ from splatseg_bench.maps import map_scores
 from splatseg_bench.options import BenchOptions
 from splatseg_bench.points import point_scores
 from splatseg_bench.protocols import (
-    TABLE_1,
     PointSwitches,
     Protocol,
-    PublishedFigure,
     RoomSwitches,
     StreetSwitches,
     TargetSwitches,
     find_protocol,
     mask_scores,
-    published_figures,
     switch_value,
 )
 from splatseg_bench.results import (
@@ -57,6 +52,7 @@ from splatseg_bench.results import (
     switches_of,
 )
 from splatseg_bench.rooms import check_room, room_scores
+from splatseg_bench.scene import BenchmarkScene
 from splatseg_bench.scenes import asked_scenes, fitted_scene, gaussians_digest, scene_notes
 from splatseg_bench.streets import Drive, point_rules
 from splatseg_bench.targets import TargetRun
@@ -92,6 +88,7 @@ def bench(
     options: BenchOptions | None = None,
     backend: BackendName = "auto",
     command: str = "",
+    executor: Executor = LOCAL,
     observer: Observer = SILENT,
 ) -> BenchRun:
     """Run methods under a published protocol: fit, see, segment, score.
@@ -106,6 +103,7 @@ def bench(
         options: Methods, models, fits, and choices other than the protocol's.
         backend: Who renders.
         command: The words that started it, for the record; may be empty.
+        executor: Where scenes are fitted and measured.
         observer: Is told of the progress.
 
     Raises:
@@ -138,27 +136,16 @@ def bench(
             if wanted != "prompts":
                 kinds = kinds_wanted(chosen, method)
                 chosen_model(method, one, words=wanted == "words", kinds=kinds, options=options)
-    prompter, grounder = _models(chosen, options, observer)
-    found: dict[str, list[SceneResult]] = {}
-    kept = 0
-    for one in scenes:
         for note in one.notes if one.notes != one.capture.notes else ():
             observer.note(f"{one.name}: {note.rstrip('.')}")
-        scene = fitted_scene(
-            one, chosen, folder, options=options, backend=backend, command=command,
-            observer=observer,
-        )  # fmt: skip
-        digest = gaussians_digest(scene)
-        for method in methods:
-            job = Job(
-                protocol=chosen, bench=one, scene=scene, method=method, root=folder,
-                prompter=prompter, grounder=grounder, options=options, backend=backend,
-                observer=observer,
-            )  # fmt: skip
-            for row, scored in _rows(job):
-                result, was_kept = _result(row, scored, digest, command)
-                found.setdefault(row.row, []).append(result)
-                kept += was_kept
+    found: dict[str, list[SceneResult]] = {}
+    kept = 0
+    running = _Running.of(chosen, folder, options, backend, command, observer=observer)
+    with closing(executor.map(_measured_scene, scenes, shared=running)) as results:
+        for result, was_kept in results:
+            _tell(result, chosen, kept=was_kept, observer=observer)
+            found.setdefault(result.method, []).append(result)
+            kept += was_kept
     measured = [over_scenes(chosen, name, results) for name, results in found.items()]
     others = [one for root in options.beside for one in results_of(root, chosen)]
     for one in others:
@@ -171,6 +158,78 @@ def bench(
         kept=kept,
         notes=tuple(notes),
     )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Running:
+    """What the scenes of a run have in common."""
+
+    protocol: Protocol
+    folder: Path
+    options: BenchOptions
+    backend: BackendName
+    command: str
+    observer: Observer
+    prompter: Model | None
+    grounder: GroundedMasks | None
+
+    @classmethod
+    def of(
+        cls,
+        protocol: Protocol,
+        folder: Path,
+        options: BenchOptions,
+        backend: BackendName,
+        command: str,
+        *,
+        observer: Observer = SILENT,
+    ) -> "_Running":
+        """Opens the models that answer prompts."""
+        prompter, grounder = _models(protocol, options, observer)
+        return cls(
+            protocol=protocol, folder=folder, options=options, backend=backend, command=command,
+            observer=observer, prompter=prompter, grounder=grounder,
+        )  # fmt: skip
+
+    def __reduce__(self) -> tuple[Callable[..., "_Running"], tuple[Any, ...]]:
+        """What another process gets: models of its own, and nobody to tell."""
+        given = (self.protocol, self.folder, self.options, self.backend, self.command)
+        return _Running.of, given
+
+
+def _measured_scene(running: _Running, one: BenchmarkScene) -> Iterator[tuple[SceneResult, bool]]:
+    """Fit a scene and measure all methods in it: each result, and whether it was there."""
+    scene = fitted_scene(
+        one,
+        running.protocol,
+        running.folder,
+        options=running.options,
+        backend=running.backend,
+        command=running.command,
+        observer=running.observer,
+    )
+    digest = gaussians_digest(scene)
+    for name in running.options.methods:
+        job = Job(
+            protocol=running.protocol, bench=one, scene=scene, method=find_method(name),
+            root=running.folder, prompter=running.prompter, grounder=running.grounder,
+            options=running.options, backend=running.backend, observer=running.observer,
+        )  # fmt: skip
+        for row, scored in _rows(job):
+            yield _result(row, scored, digest, running.command)
+
+
+def _tell(result: SceneResult, protocol: Protocol, *, kept: bool, observer: Observer) -> None:
+    """Tell what was measured, or that it was."""
+    where = f"{result.scene}, {result.method}"
+    if kept:
+        observer.info(f"{where}: as it was measured before")
+        return
+    figure = result.scores.get(protocol.measure)
+    shown = "not measured" if figure is None else f"{figure:.4f}"
+    observer.info(f"{where}: {protocol.measure} {shown}")
+    for note in result.notes:
+        observer.note(f"{where}: {note.rstrip('.')}")
 
 
 def _rows(job: Job) -> list[tuple[Job, "_Scorer"]]:
@@ -189,7 +248,6 @@ def _result(job: Job, scored: "_Scorer", digest: str, command: str) -> tuple[Sce
     path = result_path(job.root, job.protocol.name, job.row, job.bench.name)
     before = None if job.options.again else kept_result(path, key)
     if before is not None:
-        job.observer.info(f"{job.bench.name}, {job.row}: as it was measured before")
         return before, True
     began = time.monotonic()
     scores, rows, notes = scored(job)
@@ -206,11 +264,6 @@ def _result(job: Job, scored: "_Scorer", digest: str, command: str) -> tuple[Sce
         key=key,
     )
     save_result(result, path)
-    figure = scores.get(job.protocol.measure)
-    shown = "not measured" if figure is None else f"{figure:.4f}"
-    job.observer.info(f"{job.bench.name}, {job.row}: {job.protocol.measure} {shown}")
-    for note in notes:
-        job.observer.note(f"{job.bench.name}, {job.row}: {note.rstrip('.')}")
     return result, False
 
 
@@ -289,178 +342,3 @@ def _models(
     if not isinstance(grounder, GroundedMasks):
         raise InputError(f"grounder: expected a model that finds words, got {grounder.name}.")
     return None, grounder
-
-
-# Results of a protocol as tables, with the published figures beside them.
-
-
-MEASURED = "measured here"
-_UNVERIFIED = " (not verified)"
-_KINDS = (".md", ".csv", ".tex")
-
-
-def bench_table(
-    run: BenchRun, *, notes: bool = True, classes: bool = True
-) -> tuple[tuple[str, ...], list[tuple[Cell, ...]]]:
-    """Names of columns, and a row a method: measured ones first, then published ones.
-
-    Published are means over the protocol's scenes; where none is known, figures of single scenes.
-
-    Scores are shares in [0, 1], PSNR in decibels; an empty cell was not measured, or not published.
-
-    Args:
-        run: What was measured.
-        notes: Whether sources of published figures come with what is known of their settings.
-        classes: Whether figures of single classes of streets have columns.
-    """
-    published = published_figures(run.protocol.name)
-    means = [one for one in published if one.scene is None] or list(published)
-    measures = list(dict.fromkeys(name for one in (*run.methods, *means) for name in one.scores))
-    if not classes:
-        measures = [name for name in measures if name not in TABLE_1]
-    scenes = list(dict.fromkeys(one.scene for method in run.methods for one in method.scenes))
-    if len(scenes) < 2:
-        scenes = []
-    columns = ("method", *measures, *scenes, "source")
-    rows = [_measured(method, measures, scenes, run) for method in run.methods]
-    rows += [_published(one, measures, scenes, published, run, notes=notes) for one in means]
-    return columns, rows
-
-
-def write_tables(run: BenchRun, folder: Path, *, command: str = "") -> tuple[Path, ...]:
-    """Write PROTOCOL.md, .csv, .tex, .html and .json into a folder.
-
-    Args:
-        run: What was measured.
-        folder: Where to write.
-        command: The words that started it, for the record.
-    """
-    columns, rows = bench_table(run)
-    paths = [path_inside(folder, f"{run.protocol.name}{kind}") for kind in _KINDS]
-    for path in paths:
-        write_table(rows, path, columns=columns)
-    page = path_inside(folder, f"{run.protocol.name}.html")
-    with atomic_file(page) as temporary:
-        temporary.write_text(report_html(_report(run, command)), encoding="utf-8")
-    record = path_inside(folder, f"{run.protocol.name}.json")
-    write_json(
-        {
-            "protocol": run.protocol.name,
-            "switches": switches_of(run.protocol),
-            "command": command,
-            "notes": list(run.notes),
-            "methods": {
-                method.method: {
-                    "scores": dict(method.scores),
-                    "oracle": list(method.oracle),
-                    "scenes": {one.scene: dict(one.scores) for one in method.scenes},
-                    "keys": {one.scene: one.key for one in method.scenes},
-                }
-                for method in run.methods
-            },
-        },
-        record,
-    )
-    return (*paths, page, record)
-
-
-def _measured(
-    method: MethodResult, measures: Sequence[str], scenes: Sequence[str], run: BenchRun
-) -> tuple[Cell, ...]:
-    own = {one.scene: one.scores.get(run.protocol.measure) for one in method.scenes}
-    oracle = f", oracle {' and '.join(method.oracle)}" if method.oracle else ""
-    return (
-        method.method,
-        *(_figure(method.scores.get(name)) for name in measures),
-        *(_figure(own.get(scene)) for scene in scenes),
-        f"{MEASURED}{oracle}",
-    )
-
-
-def _published(
-    mean: PublishedFigure,
-    measures: Sequence[str],
-    scenes: Sequence[str],
-    figures: Sequence[PublishedFigure],
-    run: BenchRun,
-    *,
-    notes: bool,
-) -> tuple[Cell, ...]:
-    own = {
-        one.scene: one.scores.get(run.protocol.measure)
-        for one in figures
-        if one.method == mean.method
-        and one.source == mean.source
-        and mean.scene in (None, one.scene)
-    }
-    source = mean.source if mean.scene is None else f"{mean.source}, {mean.scene}"
-    note = f"; {mean.note}" if mean.note and notes else ""
-    return (
-        mean.method,
-        *(_figure(mean.scores.get(name)) for name in measures),
-        *(_figure(own.get(scene)) for scene in scenes),
-        f"{source}{'' if mean.verified else _UNVERIFIED}{note}",
-    )
-
-
-def _figure(value: float | None) -> Cell:
-    return "" if value is None else value
-
-
-def _report(run: BenchRun, command: str) -> Report:
-    columns, rows = bench_table(run)
-    ours = [row for row in rows if str(row[-1]).startswith(MEASURED)]
-    theirs = [row for row in rows if not str(row[-1]).startswith(MEASURED)]
-    protocol = run.protocol
-    notices = [Notice(verdict="Note", sentence=note) for note in run.notes]
-    if any(method.oracle for method in run.methods):
-        notices.append(
-            Notice(
-                verdict="Oracle",
-                sentence="Something was chosen with the help of the truth that is evaluated.",
-                warns=True,
-            )
-        )
-    blocks = [_table("Measured here", columns, ours)]
-    if theirs:
-        blocks.append(
-            _table(
-                "Published",
-                columns,
-                theirs,
-                note="Other programs, other fits, and choices that were not always stated.",
-            )
-        )
-    switches = [(name, _text(value)) for name, value in switches_of(protocol).items()]
-    blocks.append(Table(title="Choices", columns=("switch", "value"), rows=tuple(switches)))
-    commands = {str(one.made.get("command")) for m in run.methods for one in m.scenes}
-    return Report(
-        title=protocol.name,
-        summary=f"{protocol.summary[0].upper()}{protocol.summary[1:]}. {protocol.reference}. "
-        + (f"{protocol.note[0].upper()}{protocol.note[1:]}." if protocol.note else ""),
-        command=command,
-        notices=tuple(notices),
-        blocks=(
-            *blocks,
-            Commands(title="Commands of the results", lines=tuple(sorted(commands - {""}))),
-        ),
-    )
-
-
-def _table(
-    title: str, columns: Sequence[str], rows: Sequence[tuple[Cell, ...]], note: str = ""
-) -> Table:
-    return Table(
-        title=title,
-        columns=tuple(columns),
-        rows=tuple(tuple(None if cell == "" else cell for cell in row) for row in rows),
-        note=note,
-    )
-
-
-def _text(value: object) -> str:
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, list):
-        return ", ".join(map(str, value)) or "none"  # pyright: ignore[reportUnknownArgumentType, reportUnknownVariableType]
-    return "none" if value is None else str(value)

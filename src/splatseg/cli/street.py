@@ -15,6 +15,7 @@ from splatseg.report.words import counted
 from splatseg.street.build import DnmpOptions
 from splatseg.street.field import VERTEX_WORDS
 from splatseg.tasks import (
+    ExecutorOptions,
     LabelBy,
     ScanLabelOptions,
     ScanLabels,
@@ -22,6 +23,7 @@ from splatseg.tasks import (
     StreetField,
     StreetOptions,
     open_drive,
+    open_executor,
     scans_to_label,
     street_scene,
 )
@@ -93,6 +95,9 @@ class Command(Printing):
     backend: Backend = "auto"
     data: Data = None
 
+    executing: tyro.conf.OmitArgPrefixes[ExecutorOptions] = field(default_factory=ExecutorOptions)
+    """Where scans are labelled (--label-scans)."""
+
 
 def run(command: Command) -> None:
     """Make the field of a drive, label its scans, or both."""
@@ -110,20 +115,22 @@ def run(command: Command) -> None:
         # Before a field is made, which takes minutes.
         scans = scans_to_label(command.label_scans, command.output, options=options)
     scene = open_drive(command.drive, new_scene=command.new_scene, data=command.data)
-    done = street_scene(
-        scene,
-        options=command.inputs,
-        field_options=command.primitives,
-        scans=scans,
-        labels=command.output,
-        by=command.by,
-        form=options,
-        report=command.report,
-        overwrite=command.overwrite,
-        command=typed(sys.argv),
-        backend=command.backend,
-        observer=command.observer,
-    )
+    with open_executor(command.executing, observer=command.observer) as executor:
+        done = street_scene(
+            scene,
+            options=command.inputs,
+            field_options=command.primitives,
+            scans=scans,
+            labels=command.output,
+            by=command.by,
+            form=options,
+            report=command.report,
+            overwrite=command.overwrite,
+            command=typed(sys.argv),
+            backend=command.backend,
+            executor=executor,
+            observer=command.observer,
+        )
     root = command.new_scene or command.drive
     facts: dict[str, Any] = {"scene": root}
     lines: list[str] = []

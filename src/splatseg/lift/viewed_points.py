@@ -21,7 +21,9 @@ Any `splatseg.core.Renderable` can be asked, Gaussians or surfaces: it shows lab
 import math
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from contextlib import closing
+from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int, Int64
@@ -29,8 +31,10 @@ from torch import Tensor
 
 from splatseg._check import check_finite, check_shape
 from splatseg.core import (
+    LOCAL,
     UNLABELLED,
     Camera,
+    Executor,
     PointLabels,
     Renderable,
     RenderableLayer,
@@ -279,6 +283,10 @@ class ViewedPoints:
         self._unit = metres_per_unit
         self._drawn: OrderedDict[tuple[str, int], PointView] = OrderedDict()
 
+    def __getstate__(self) -> dict[str, Any]:
+        """What another process gets: it draws views itself."""
+        return self.__dict__ | {"_drawn": OrderedDict()}
+
     @property
     def layer_names(self) -> Sequence[str]:
         """Names of all layers."""
@@ -313,31 +321,51 @@ class ViewedPoints:
         cloud = self._cloud(points, layer, ids)
         return self._decided(cloud, self._forest([self._sample(cloud, slice(None))]), ids)
 
-    def labels_of_scans(self, scans: ScanSource, layer: str) -> Iterator[tuple[str, PointLabels]]:
+    def labels_of_scans(
+        self, scans: ScanSource, layer: str, *, executor: Executor = LOCAL
+    ) -> Iterator[tuple[str, PointLabels]]:
         """Labels of the points of every scan, by its name, in the order of the source.
 
         Scans are put together in windows with some of those before and after them; shapes are
         learnt from all windows, a bounded sample, before any is labelled. Nothing holds more
         than a window.
 
+        Args:
+            scans: Where they are read.
+            layer: Address of a layer with labels.
+            executor: Where windows are worked on.
+
         Raises:
             InputError: If the field has no such layer, it has no labels, or a scan is broken.
         """
-        ids = self._ids(layer)
-        names = list(scans.scan_names)
+        windows = _Windows(points=self, scans=scans, layer=layer, ids=self._ids(layer))
+        starts = range(0, len(scans.scan_names), self._options.window)
         sample: list[ShapeSamples] = []
         if self._options.shapes:
-            for start in range(0, len(names), self._options.window):
-                points, rows = self._window(scans, names, start)
-                own = slice(rows[0][1].start, rows[-1][1].stop)
-                found = self._sample(self._cloud(points, layer, ids), own)
-                sample = [drawn([*sample, found], SAMPLES)]
-        forest = self._forest(sample)
-        for start in range(0, len(names), self._options.window):
-            points, rows = self._window(scans, names, start)
-            labels = self._decided(self._cloud(points, layer, ids), forest, ids)
-            for name, part in rows:
-                yield name, PointLabels(ids=labels.ids[part], confidence=labels.confidence[part])
+            with closing(executor.map(ViewedPoints._samples, starts, shared=windows)) as found:
+                for one in found:
+                    sample = [drawn([*sample, one], SAMPLES)]
+        windows = replace(windows, forest=self._forest(sample))
+        with closing(executor.map(ViewedPoints._labels, starts, shared=windows)) as labelled:
+            yield from labelled
+
+    @staticmethod
+    def _samples(windows: "_Windows", start: int) -> Iterator[ShapeSamples]:
+        """Cells of a window to learn shapes from."""
+        own = windows.points
+        points, rows = own._window(windows.scans, windows.scans.scan_names, start)
+        cloud = own._cloud(points, windows.layer, windows.ids)
+        yield own._sample(cloud, slice(rows[0][1].start, rows[-1][1].stop))
+
+    @staticmethod
+    def _labels(windows: "_Windows", start: int) -> Iterator[tuple[str, PointLabels]]:
+        """Labels of the scans of a window, by name."""
+        own = windows.points
+        points, rows = own._window(windows.scans, windows.scans.scan_names, start)
+        cloud = own._cloud(points, windows.layer, windows.ids)
+        labels = own._decided(cloud, windows.forest, windows.ids)
+        for name, part in rows:
+            yield name, PointLabels(ids=labels.ids[part], confidence=labels.confidence[part])
 
     def _window(
         self, scans: ScanSource, names: Sequence[str], start: int
@@ -433,6 +461,17 @@ class ViewedPoints:
             out = torch.where(best > 0, known[winner], UNLABELLED).int()
             confidence = best.clamp(0, 1)
         return PointLabels(ids=out[cloud.cells.cell_of], confidence=confidence[cloud.cells.cell_of])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Windows:
+    """What all windows of scans have in common; a window is where its own scans begin."""
+
+    points: ViewedPoints
+    scans: ScanSource
+    layer: str
+    ids: tuple[int, ...]
+    forest: ShapeForest | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -3,6 +3,7 @@
 import tempfile
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -15,8 +16,10 @@ from typing_extensions import override
 
 from splatseg._check import check_shape
 from splatseg.core import (
+    LOCAL,
     UNLABELLED,
     Camera,
+    Executor,
     PointLabels,
     Renderable,
     RenderableLayer,
@@ -37,7 +40,9 @@ from splatseg.street.blocks import DriveBlock, DriveBlocks
 class ScanLabeller(Protocol):
     """A field that labels many scans better or faster than one cloud after the other."""
 
-    def labels_of_scans(self, scans: ScanSource, layer: str) -> Iterator[tuple[str, PointLabels]]:
+    def labels_of_scans(
+        self, scans: ScanSource, layer: str, *, executor: Executor = LOCAL
+    ) -> Iterator[tuple[str, PointLabels]]:
         """Labels of the points of every scan, by its name, in the order of the source."""
         ...
 
@@ -118,7 +123,12 @@ class DriveField:
         return joined(parts, len(points))
 
     def labels_of_scans(
-        self, scans: ScanSource, layer: str, *, work: Path | None = None
+        self,
+        scans: ScanSource,
+        layer: str,
+        *,
+        work: Path | None = None,
+        executor: Executor = LOCAL,
     ) -> Iterator[tuple[str, PointLabels]]:
         """Labels of the points of every scan, by its name, in the order of the source.
 
@@ -130,6 +140,7 @@ class DriveField:
             scans: Scans in the world of the drive; `DriveScans` are not looked at again.
             layer: Address of a layer with labels.
             work: Folder for these files, which are gone in the end; None is the system's.
+            executor: Where the scans of a block are labelled.
 
         Raises:
             InputError: If a block has no such layer, it has no labels, or a scan is broken.
@@ -144,7 +155,10 @@ class DriveField:
             for block in self._drive.blocks:
                 own = parts.to_label(block)
                 if own.scan_names:
-                    for name, labels in _labels_of(self._field(block.index), own, layer):
+                    # No name for the field: it is dropped before the next is opened.
+                    for name, labels in labels_of_scans(
+                        self._field(block.index), own, layer, executor=executor
+                    ):
                         share = own.share(name)
                         said = WeightedLabels.of(labels, share.rows, share.weights)
                         said.save(folder / f"{numbers[name]}_{block.index}.npy")
@@ -191,14 +205,36 @@ def joined_layers(layers: Iterable[tuple[str, RenderableLayer]]) -> dict[str, Re
     return found
 
 
-def _labels_of(
-    field: Renderable, scans: ScanSource, layer: str
+def labels_of_scans(
+    field: Renderable, scans: ScanSource, layer: str, *, executor: Executor = LOCAL
 ) -> Iterator[tuple[str, PointLabels]]:
+    """Labels of the points of every scan of any field, by its name, in the order of the source.
+
+    Args:
+        field: If no `ScanLabeller`, each scan is a cloud of its own.
+        scans: Where they are read.
+        layer: Address of a layer with labels.
+        executor: Where they are worked on.
+    """
     if isinstance(field, ScanLabeller):
-        yield from field.labels_of_scans(scans, layer)
+        yield from field.labels_of_scans(scans, layer, executor=executor)
         return
-    for name in scans.scan_names:
-        yield name, field.labels_at(scans.scan(name).points, layer)
+    clouds = _Clouds(field=field, scans=scans, layer=layer)
+    with closing(executor.map(_Clouds.labels, scans.scan_names, shared=clouds)) as labelled:
+        yield from labelled
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Clouds:
+    """Scans that are labelled one by one."""
+
+    field: Renderable
+    scans: ScanSource
+    layer: str
+
+    def labels(self, name: str) -> Iterator[tuple[str, PointLabels]]:
+        """Of one of them."""
+        yield name, self.field.labels_at(self.scans.scan(name).points, self.layer)
 
 
 def _both(first: RenderableLayer | None, second: RenderableLayer) -> RenderableLayer:

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from types import MappingProxyType, TracebackType
-from typing import Literal, Self, get_args
+from typing import Any, Literal, Self, get_args
 
 import torch
 from jaxtyping import Float, Int64
@@ -310,6 +310,10 @@ class MeshField:
         columns, shares = self.query.columns(points)
         ids = torch.tensor([*self._model.ids, UNLABELLED], dtype=torch.int32)
         return PointLabels(ids=ids[columns], confidence=shares)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What another process gets: it arranges vertices and triangles itself."""
+        return {k: v for k, v in self.__dict__.items() if k not in ("query", "caster")}
 
     @cached_property
     def query(self) -> BallQuery:

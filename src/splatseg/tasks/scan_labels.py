@@ -3,9 +3,19 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
-from splatseg.core import Labels, Layer, PointLabels, Renderable, Scan, ScanSource, Scene
+from splatseg.core import (
+    LOCAL,
+    Executor,
+    Labels,
+    Layer,
+    PointLabels,
+    Renderable,
+    Scan,
+    ScanSource,
+    Scene,
+)
 from splatseg.core.boundary import boundary
 from splatseg.core.options import options as options_class
 from splatseg.errors import InputError
@@ -13,7 +23,7 @@ from splatseg.io.export import ScanLabelCounts, ScanLabelForm, check_replaceable
 from splatseg.io.scans import Scans, read_scans
 from splatseg.lift.viewed_points import ViewedPointOptions, ViewedPoints
 from splatseg.render import BackendName
-from splatseg.street.block_field import DriveField, ScanLabeller
+from splatseg.street.block_field import DriveField, labels_of_scans
 from splatseg.street.field import MeshField
 from splatseg.tasks.work import SILENT, Observer, Work
 
@@ -86,6 +96,7 @@ def label_scans(
     layers: Mapping[str, Layer] | None = None,
     seen: Callable[[Scan, PointLabels], None] | None = None,
     backend: BackendName = "auto",
+    executor: Executor = LOCAL,
     observer: Observer = SILENT,
 ) -> ScanLabels:
     """Label the points of all scans, one after the other, and write a folder of labels.
@@ -101,6 +112,7 @@ def label_scans(
         layers: Layers at hand; others are read from the scene's folder.
         seen: Is given every scan with its labels.
         backend: Rendering backend of the Gaussians.
+        executor: Where scans are labelled.
         observer: Is told of the progress.
 
     Raises:
@@ -130,9 +142,10 @@ def label_scans(
         raise InputError(f"layer: expected labels, {layer!r:.80} holds {summary.kind}.")
     form = _form(scans) if options.form == "auto" else options.form
     rule = _vertex_rule(field, layer)
+    kept = _Kept(scans)
     with observer.stage("label scans") as step:
         counts = write_scan_labels(
-            _labelled(field, scans, layer, step, seen),
+            _told(labels_of_scans(field, kept, layer, executor=executor), kept, step, seen),
             folder,
             form=form,
             array_shape=scans.array_shape if form == "npz" else None,
@@ -163,6 +176,10 @@ class _Kept:
         self._scans = scans
         self._last: Scan | None = None
 
+    def __getstate__(self) -> dict[str, Any]:
+        """What another process gets: it reads scans itself."""
+        return {"_scans": self._scans, "_last": None}
+
     @property
     def scan_names(self) -> tuple[str, ...]:
         return tuple(self._scans.scan_names)
@@ -173,27 +190,19 @@ class _Kept:
         return self._last
 
 
-def _labelled(
-    field: Renderable,
-    scans: Scans,
-    layer: str,
+def _told(
+    found: Iterator[tuple[str, PointLabels]],
+    scans: _Kept,
     step: Callable[[int, int], None],
     seen: Callable[[Scan, PointLabels], None] | None,
 ) -> Iterator[tuple[Scan, PointLabels]]:
     """Scans with their labels, in their order; `seen` is given them, too."""
-    kept = _Kept(scans)
-    names = kept.scan_names
-    found = (
-        field.labels_of_scans(kept, layer)
-        if isinstance(field, ScanLabeller)
-        else ((name, field.labels_at(kept.scan(name).points, layer)) for name in names)
-    )
     for done, (name, labels) in enumerate(found, start=1):
-        scan = kept.scan(name)
+        scan = scans.scan(name)
         if seen is not None:
             seen(scan, labels)
         yield scan, labels
-        step(done, len(names))
+        step(done, len(scans.scan_names))
 
 
 @boundary

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from splatseg.core import PointLabels, Renderable, Scan, Scene
+from splatseg.core import LOCAL, Executor, PointLabels, Renderable, Scan, Scene
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError
 from splatseg.io.scans import Scans
@@ -65,6 +65,7 @@ def street_scene(
     overwrite: bool = False,
     command: str = "",
     backend: BackendName = "auto",
+    executor: Executor = LOCAL,
     observer: Observer = SILENT,
 ) -> StreetScene:
     """Make the mesh field of a drive, label its scans, or both.
@@ -85,6 +86,7 @@ def street_scene(
         overwrite: Whether a field of this name is made anew.
         command: The words that started it, for the page; may be empty.
         backend: Rendering backend.
+        executor: Where scans are labelled.
         observer: Is told of the progress.
 
     Raises:
@@ -129,6 +131,7 @@ def street_scene(
             ),
             seen=keep if report else None,
             backend=backend,
+            executor=executor,
             observer=observer,
         )
         labelled = LabelledScans(made=written, by=by, points=kept, classes=scans.classes)

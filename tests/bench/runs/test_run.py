@@ -32,8 +32,11 @@ from splatseg_bench.layouts import read_benchmark
 from splatseg_bench.options import BenchOptions
 from splatseg_bench.protocols import find_protocol
 from splatseg_bench.results import load_result
-from splatseg_bench.run import BenchRun, bench, bench_table
+from splatseg_bench.run import BenchRun, bench
 from splatseg_bench.scenes import held_out_views
+from splatseg_bench.tables import bench_table
+from support.elsewhere import Elsewhere
+from support.observers import Stopping
 from support.red_square import NAMES, SIZE, save_strokes
 
 
@@ -68,6 +71,25 @@ def test_a_method_is_measured_once(run, tmp_path) -> None:
     assert "boundary_iou" not in made.scores
     assert made.made["command"] == "c"
     assert made.switches["boundary_ratio"] is None
+
+
+def test_scenes_that_are_measured_elsewhere_have_the_same_results(tiny, run, tmp_path) -> None:
+    data, scenes = tiny
+    here = run().methods[0]
+    options = BenchOptions(fitted=str(scenes / "{scene}"))
+    executor, heard = Elsewhere(), Stopping()
+    there = bench(
+        "spin-nerf", data, tmp_path / "there", options=options, command="c",
+        executor=executor, observer=heard,
+    )  # fmt: skip
+    assert [one.name for one in executor.items] == ["wall"]
+    (running,) = executor.shared
+    assert running.observer is not heard
+    assert there.methods[0].scores == here.scores
+    assert there.methods[0].scenes[0].rows == here.scenes[0].rows
+    assert f"wall, uplift: iou {here.scores['iou']:.4f}" in heard.heard
+    bench("spin-nerf", data, tmp_path / "there", options=options, executor=executor, observer=heard)
+    assert heard.heard[-1] == "wall, uplift: as it was measured before"
 
 
 def test_the_prompts_view_counts_where_the_protocol_says_so(run) -> None:

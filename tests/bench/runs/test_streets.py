@@ -23,9 +23,10 @@ from splatseg_bench.layouts import read_benchmark
 from splatseg_bench.options import BenchOptions
 from splatseg_bench.protocols import TABLE_1, find_protocol, merged_name
 from splatseg_bench.results import load_result
-from splatseg_bench.run import BenchRun, bench, bench_table
+from splatseg_bench.run import BenchRun, bench
 from splatseg_bench.scene import BenchmarkScene
 from splatseg_bench.scenes import scans_of
+from splatseg_bench.tables import bench_table
 from support.benchmark_layouts import read_source, write_layout
 from support.benchmark_layouts.evidence import write_evidence
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from splatseg.core import Camera, PointLabels, Renderable, ScanSource
+from splatseg.core import Camera, Executor, PointLabels, Renderable, ScanSource
 from splatseg.errors import FileFormatError, InputError, MissingFileError, RangeError, ShapeError
 from splatseg.street import files
 from splatseg.street.block_field import DriveField, DriveScans, WeightedLabels, joined
@@ -203,7 +203,7 @@ def test_a_drive_that_comes_back_waits_for_its_last_block():
 def test_a_field_that_labels_scans_is_asked_for_scans():
     class Windows(Says):
         def labels_of_scans(
-            self, scans: ScanSource, layer: str
+            self, scans: ScanSource, layer: str, *, executor: Executor
         ) -> Iterator[tuple[str, PointLabels]]:
             names = list(scans.scan_names)
             for name in names:  # all are read before any is labelled, as windows are

@@ -10,7 +10,6 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -207,6 +206,22 @@ def only_one(path: Path, found: Sequence[str], what: str) -> str:
     return found[0]
 
 
+class LastResult:
+    """A function whose last result is kept; another process calls it anew."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._function = function
+        self._last: tuple[tuple[Any, ...], Any] | None = None
+
+    def __call__(self, *arguments: Any) -> Any:
+        if self._last is None or self._last[0] != arguments:
+            self._last = arguments, self._function(*arguments)
+        return self._last[1]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"_function": self._function, "_last": None}
+
+
 def read_in_pieces(
     files: Iterable[Path], opened: Callable[[Path], Piece]
 ) -> tuple[tuple[str, ...], Callable[[str], tuple[Path, Any]]]:
@@ -216,7 +231,7 @@ def read_in_pieces(
     NAME_0001 and so on.
     """
     # Pieces of a file follow each other; what was unpacked of it is kept until the next one.
-    cached = lru_cache(maxsize=1)(opened)
+    cached = LastResult(opened)
     pieces: dict[str, tuple[Path, int, int]] = {}
     for file in files:
         count, _ = cached(file)

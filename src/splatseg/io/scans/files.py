@@ -14,7 +14,7 @@ LAS and LAZ need laspy, and lazrs for LAZ. ASPRS, LAS Specification 1.4 R15: cla
 
 from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,14 @@ from splatseg.io.captures.raw_views import checked_pose
 from splatseg.io.foreign import expect, malformed, reading
 from splatseg.io.ply import read_ply_vertices
 from splatseg.io.scans._las_sizes import check_las_sizes
-from splatseg.io.scans._source import Piece, RawScan, Scans, read_in_pieces, refuse_twice
+from splatseg.io.scans._source import (
+    LastResult,
+    Piece,
+    RawScan,
+    Scans,
+    read_in_pieces,
+    refuse_twice,
+)
 from splatseg.io.schema import check_array
 
 SUFFIXES = {".las": "las", ".laz": "las", ".ply": "ply", ".npz": "npz", ".npy": "npz"}
@@ -237,7 +244,7 @@ def read_range_images(path: Path) -> Scans:
             f"{path}: expected {_RANGE_FILE} with {' or '.join(_RANGES)}, {', '.join(_NEEDED)}, "
             "got none."
         )
-    arrays = cache(partial(_range_arrays, file))
+    arrays = LastResult(partial(_range_arrays, file))
     shape = arrays()["range"].shape
     return Scans(
         path=file,
