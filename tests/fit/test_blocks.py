@@ -1,5 +1,6 @@
 """A capture in blocks: whose views and points are, how work is shared, how fits are joined."""
 
+import signal
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from splatseg.core import Capture, Edited, Gaussians, PointCloud, View
 from splatseg.core.checkpoints import Checkpoints
 from splatseg.errors import InputError
 from splatseg.evaluate import psnr, render_and_photograph
-from splatseg.fit import FitOptions, FitRecord, FitResult, cut_capture, fit, fit_blocks
+from splatseg.fit import FitOptions, FitRecord, FitResult, Refinement, cut_capture, fit, fit_blocks
 from splatseg.fit._block_fits import (
     BlockFits,
     block_checkpoint,
@@ -22,6 +23,7 @@ from splatseg.fit._block_fits import (
 )
 from splatseg.fit.blocks import CaptureBlocks
 from splatseg.lift import GaussianField
+from splatseg.render import back_project
 from splatseg.synthetic import look_at
 
 OPTIONS = FitOptions(minutes=None, steps=1000, max_gaussians=10_000)
@@ -336,6 +338,40 @@ def test_of_each_block_the_gaussians_of_its_cell_are_joined_and_refined(capture:
         f"2 blocks of {views} training views were fitted and joined.",
         f"They were refined among their neighbours in {sum(steps)} steps.",
     )
+
+
+def test_a_block_is_refined_among_what_its_views_show(capture: Capture):
+    """As by hand: those that its views show learn, from progress 0.3 on, and its own are kept."""
+    cut = cut_capture(capture, 2, options=SHORT)
+    joined = Gaussians.concatenate(parts_of(cut))
+    block = cut.blocks[1]
+    own = cut.cells.cell_of(joined.means) == 1
+    given = own.clone()
+    for view in block.border_views:
+        ones = torch.ones(view.camera.height, view.camera.width, 1)
+        given |= back_project(joined, view.camera, ones).weights > 0
+    run = Refinement(joined[given], block.border_views, steps=7, start=0.3, options=block.options)
+    for _ in range(7):
+        run.step()
+    kept = torch.nonzero(given).squeeze(1)
+    wanted = run.gaussians()[torch.isin(kept, torch.nonzero(own).squeeze(1))]
+    found = refine_block(BlockFits(cells=cut.cells, joined=joined), block, steps=7)
+    assert same(found, wanted)
+    assert len(found) == int(own.sum())
+
+
+def test_ctrl_c_ends_a_refinement_after_the_step(capture: Capture):
+    cut = cut_capture(capture, 2, options=SHORT)
+    heard: list[float] = []
+
+    def stop(index: int, done: float) -> None:
+        heard.append(done)
+        if len(heard) == 2:
+            signal.raise_signal(signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt, match="^2 of 2 blocks are fitted, but not refined$"):
+        fit_blocks(cut, refining=stop)
+    assert len(heard) == 2
 
 
 def test_a_refinement_has_a_fifth_of_the_steps_and_each_view_as_many():

@@ -14,7 +14,7 @@ from splatseg.fit._block_fits import refined_steps
 from splatseg.io.captures import read_capture
 from splatseg.io.scene import load_scene
 from splatseg.io.scene_folder import BLOCKS_FOLDER, CHECKPOINT_FILE, is_scene, is_unfinished
-from splatseg.tasks import MakeSceneOptions, describe, fit_capture
+from splatseg.tasks import MakeSceneOptions, Observer, describe, fit_capture
 from support.elsewhere import Elsewhere
 from support.observers import Cancelled, Stopping
 
@@ -85,6 +85,24 @@ def test_who_asks_it_to_end_is_told_how_it_goes_on(small_room, straight, tmp_pat
     assert not is_scene(folder)
     made_of(small_room, folder, GOING_ON)
     assert gaussians(folder) == gaussians(straight)
+
+
+def test_progress_goes_on_from_fits_to_refinements(small_room, straight, tmp_path):
+    class Listening(Observer):
+        def __init__(self) -> None:
+            self.heard: list[float] = []
+
+        def progress(self, stage: str, done: int, total: int) -> None:
+            if stage == "fit":
+                self.heard.append(done / total)
+
+    told = Listening()
+    made_of(small_room, tmp_path / "scene", observer=told)
+    views = load_scene(straight).provenance["blocks"]["views"]
+    fits = sum(round(8 * len(one)) for one in views)
+    assert told.heard == sorted(told.heard)
+    assert told.heard[fits - 1] == pytest.approx(0.8, abs=1e-3)
+    assert told.heard[-1] == 1.0
 
 
 def test_who_stops_a_refinement_loses_no_block(small_room, straight, tmp_path):
