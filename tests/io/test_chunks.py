@@ -194,6 +194,22 @@ def test_a_level_of_other_chunks_is_refused(rng, tmp_path, monkeypatch) -> None:
         level_rows(other, 2)
 
 
+def test_a_level_of_chunks_of_other_lengths_is_refused(rng, tmp_path, monkeypatch) -> None:
+    """As many chunks, and the last of them longer."""
+    monkeypatch.setattr(files, "CHUNK_ROWS", 100)
+    for name, count in (("long", 640), ("short", 620)):
+        gaussians = some(rng, count)
+        (tmp_path / name).mkdir()
+        write_chunks(
+            lambda a, b, of=gaussians: of[a:b], count, tmp_path / name, memory=10**9, levels=1
+        )
+    level = level_folder(tmp_path / "short", 1)
+    shutil.rmtree(level)
+    shutil.copytree(level_folder(tmp_path / "long", 1), level)
+    with pytest.raises(FileFormatError, match="the chunks of level 0, coarser, got others"):
+        level_rows(tmp_path / "short", 1)
+
+
 def test_the_source_must_be_renderable_and_not_empty(gaussians, tmp_path) -> None:
     bad = gaussians.replace(opacities=gaussians.opacities + 2)
     with pytest.raises(RangeError, match="opacities"):

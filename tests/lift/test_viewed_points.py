@@ -1,5 +1,6 @@
 """Points of a field of any kind, seen by its views, and told by their shapes where none sees."""
 
+import pickle
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -59,6 +60,14 @@ def test_views_tell_what_they_see_and_nothing_of_what_they_do_not() -> None:
     found = viewed().labels_at(torch.tensor([FRONT, BACK, BESIDE, ground]), "things")
     assert found.ids.tolist() == [BALL, -1, -1, FLOOR]
     assert found.confidence.tolist() == [1, 0, 0, 1]
+
+
+def test_another_process_gets_no_views_that_were_drawn() -> None:
+    points = viewed()
+    before = len(pickle.dumps(points))
+    points.labels_at(torch.tensor([FRONT]), "things")
+    assert len(pickle.dumps(points)) == before
+    assert pickle.loads(pickle.dumps(points)).labels_at(torch.tensor([FRONT]), "things").ids == BALL
 
 
 def test_each_tolerance_counts_and_lengths_are_metres(monkeypatch) -> None:
