@@ -12,7 +12,7 @@ import torch
 from splatseg.core import Gaussians, InstanceTree, Labels, Scene, Selection
 from splatseg.core.executor import LocalExecutor
 from splatseg.edit import Document, load_document
-from splatseg.errors import FileFormatError, InputError
+from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.io import chunks as files
 from splatseg.io.evidence import open_evidence
 from splatseg.io.scene import load_scene, save_scene, save_scene_layer
@@ -192,6 +192,8 @@ def test_which_way_is_told(whole, chunked, tmp_path) -> None:
     for given in ({"levels": 1}, {"harmonics": "float16"}):
         with pytest.raises(InputError, match="whole: takes no"):
             ChunkOptions(whole=True, **given)
+    with pytest.raises(MissingFileError, match="there is no such scene or file"):
+        chunk_scene(tmp_path / "none", tmp_path / "made", options=ChunkOptions(whole=True))
     with pytest.raises(InputError, match="level: goes with `whole`"):
         ChunkOptions(level=1)
     with pytest.raises(InputError, match="expected a new folder"):

@@ -12,7 +12,7 @@ from splatseg.core.boundary import boundary
 from splatseg.core.gaussians import no_gaussians
 from splatseg.core.options import Natural
 from splatseg.core.options import options as options_class
-from splatseg.errors import InputError
+from splatseg.errors import InputError, MissingFileError
 from splatseg.io.captures import read_capture
 from splatseg.io.chunks import (
     CHUNKS_FOLDER,
@@ -108,12 +108,15 @@ def chunk_scene(
         observer: Is told of the progress.
 
     Raises:
-        InputError: If the source is in chunks already, or not yet with `whole`, or is no PLY file.
+        MissingFileError: If there is no source.
+        InputError: If it is in chunks already, or not yet with `whole`, or is no PLY file.
         FileFormatError: If it is damaged.
     """
     options = options or ChunkOptions()
     memory = memory_to_use(None) if memory is None else memory
     check_new_folder(folder)
+    if not source.exists():
+        raise MissingFileError(f"{source}: there is no such scene or file.")
     chunked = is_in_chunks(source / CHUNKS_FOLDER)
     if options.whole:
         if not chunked:
