@@ -103,7 +103,6 @@ def test_without_it_half_of_the_machine_is_used(chunked, monkeypatch) -> None:
         "sharpen CHUNKED -o HERE/made --layer a",
         "query CHUNKED chair",
         "select CHUNKED --text chair",
-        "view CHUNKED --no-open",
         "export CHUNKED -o HERE/made.spz",
         "export CHUNKED -o HERE/made --what points",
         "segment CHUNKED --method uplift --evidence labels_semantic --report",
