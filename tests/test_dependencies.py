@@ -19,6 +19,7 @@ EXTRAS: dict[str, list[str]] = PROJECT["optional-dependencies"]
 TOOLS = {  # of dev: programs, and what a test runs in a process of its own
     "import-linter", "pytest-xdist", "ruff", "pyright",
     "scikit-build-core", "nanobind", "cmake", "ninja",
+    "sphinx", "myst-nb", "furo", "sphinx-copybutton",
 }  # fmt: skip
 ELSEWHERE = {ROOT / "tests/golden/make_annotations.py"}
 """Run in an environment of its own, beside the tools whose files it makes."""
@@ -142,4 +143,4 @@ def test_the_build_has_the_same_minimums_everywhere() -> None:
 def test_readme_says_what_to_install_before_the_first_command() -> None:
     before, _, _ = (ROOT / "README.md").read_text(encoding="utf-8").partition("```console")
     assert "--torch-backend cpu torch" in before
-    assert "pip install '.[sfm]'" in before, "what `fit PHOTOS` needs"
+    assert "pip install '.[sfm,viewer]'" in before, "what `fit PHOTOS` and `view` need"

@@ -35,6 +35,15 @@ def browser(chromium_path) -> Iterator[Browser]:
 
 
 @pytest.fixture(scope="session")
+def axe() -> str:
+    """Source of axe-core, which npm has and we have not."""
+    named = os.environ.get("SPLATSEG_AXE")
+    if not named:
+        pytest.skip("SPLATSEG_AXE does not name axe.min.js (npm install axe-core, as .ci/run does)")
+    return Path(named).read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="session")
 def browser_scene(tmp_path_factory) -> Path:
     """Three balls with a layer that knows them."""
     return write_browser_scene(tmp_path_factory.mktemp("balls") / "balls")

@@ -1,6 +1,5 @@
 """The page as a whole: reloads, crashes, others, narrow, dark, by the keyboard, for everybody."""
 
-import os
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -305,15 +304,6 @@ def test_help_and_keys_of_one_letter(tab) -> None:
     tab.key("Escape")
     tab.button("Click").click()
     assert tab.button("Click").get_attribute("aria-pressed") == "true"
-
-
-@pytest.fixture(scope="session")
-def axe() -> str:
-    """Source of axe-core, which npm has and we have not."""
-    named = os.environ.get("SPLATSEG_AXE")
-    if not named:
-        pytest.skip("SPLATSEG_AXE does not name axe.min.js (npm install axe-core, as .ci/run does)")
-    return Path(named).read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(
