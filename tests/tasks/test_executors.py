@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+import signal
 import socket
 import subprocess
 import sys
@@ -47,7 +48,7 @@ from splatseg.tasks import (
     see,
     segment,
 )
-from splatseg.tasks.executors import _packed, _unpacked
+from splatseg.tasks.executors import _hear_interrupts, _packed, _unpacked
 from splatseg.tasks.work import Work
 from support import executed
 
@@ -158,6 +159,20 @@ def test_what_is_closed_ends_what_runs(workers, tmp_path, lost: int) -> None:
     (again := tmp_path / "again").mkdir()
     assert max(workers.map(executed.together, range(4), shared=(again, 2))) == 2, "both are free"
     assert [path.name for path in folder.iterdir()] == ["0"]
+
+
+def test_a_worker_that_was_started_in_the_background_can_be_interrupted() -> None:
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        _hear_interrupts()
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        own = signal.signal(signal.SIGINT, lambda *_: None)
+        _hear_interrupts()
+        signal.raise_signal(signal.SIGINT)  # another's handler stays
+        assert own is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_shared_values_lie_in_a_worker_once(workers) -> None:

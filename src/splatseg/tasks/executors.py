@@ -411,6 +411,7 @@ def _run(
 ) -> list[Any]:
     """What a function yields of an item, and the CPU time it took, packed."""
     began = time.process_time()
+    _hear_interrupts()
     torch.set_num_threads(1)
     set_threads(cpus)
     name = put[0].hex()
@@ -419,6 +420,13 @@ def _run(
         _held[name] = _unpacked(import_package("ray", "executor", "ray").get(put[0]))
     results = list(function(_held[name], item))
     return _packed((results, time.process_time() - began))
+
+
+def _hear_interrupts() -> None:
+    """Let Ray cancel what runs: what a shell starts in the background ignores SIGINT, and so do all
+    processes that come of it."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 # Values on their way.
