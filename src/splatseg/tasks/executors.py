@@ -423,8 +423,10 @@ def _run(
 
 
 def _hear_interrupts() -> None:
-    """Let Ray cancel what runs: what a shell starts in the background ignores SIGINT, and so do all
-    processes that come of it."""
+    """Let Ray cancel what runs.
+
+    What a shell starts in the background ignores SIGINT, and so do all processes that come of it.
+    """
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
