@@ -8,7 +8,6 @@ file.
 
 import importlib
 import inspect
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -56,15 +55,15 @@ _PACKAGES = (
 )  # fmt: skip
 
 
-def _write_commands() -> None:
-    """A page with the help of every command."""
+def _commands() -> str:
+    """The help of every command."""
     lines = ["# Commands", "", "What `splatseg COMMAND --help` says.", ""]
     for page in sorted((ROOT / "src/splatseg/cli/pages").glob("*.txt")):
         command, _, of = page.stem.partition("-")
         flag = {"segment": " --method ", "see": " --model "}.get(command, "-") if of else ""
         lines += [f"## splatseg {command}{flag}{of}", "", "```text", page.read_text().rstrip()]
         lines += ["```", ""]
-    (REFERENCE / "commands.md").write_text("\n".join(lines), encoding="utf-8")
+    return "\n".join(lines)
 
 
 def _public(package: str) -> list[tuple[str, str]]:
@@ -83,8 +82,9 @@ def _public(package: str) -> list[tuple[str, str]]:
     return found
 
 
-def _write_api() -> None:
-    """A page a package, and one that lists them."""
+def _api() -> dict[str, str]:
+    """By name a page a package, and one that lists them."""
+    pages: dict[str, str] = {}
     index = [
         "# API",
         "",
@@ -101,9 +101,22 @@ def _write_api() -> None:
             lines.append(f".. auto{kind}:: {package}.{name}")
             lines += ["   :members:", ""] if kind == "class" else [""]
         lines += ["```", ""]
-        (REFERENCE / f"{short}.md").write_text("\n".join(lines), encoding="utf-8")
+        pages[short] = "\n".join(lines)
         index.append(short)
-    (REFERENCE / "api.md").write_text("\n".join([*index, "```", ""]), encoding="utf-8")
+    return {"api": "\n".join([*index, "```", ""]), **pages}
+
+
+def _write_reference() -> None:
+    """Pages that changed: Sphinx reads no other again, and tests may read them meanwhile."""
+    REFERENCE.mkdir(exist_ok=True)
+    pages = {"commands": _commands(), **_api()}
+    for path in REFERENCE.glob("*.md"):
+        if path.stem not in pages:
+            path.unlink()
+    for name, text in pages.items():
+        path = REFERENCE / f"{name}.md"
+        if not path.is_file() or path.read_text(encoding="utf-8") != text:
+            path.write_text(text, encoding="utf-8")
 
 
 def _attribute(app: Sphinx, what: str, *rest: Any) -> None:
@@ -117,7 +130,4 @@ def setup(app: Sphinx) -> None:
     app.connect("autodoc-process-docstring", _attribute, priority=400)
 
 
-shutil.rmtree(REFERENCE, ignore_errors=True)
-REFERENCE.mkdir()
-_write_commands()
-_write_api()
+_write_reference()
