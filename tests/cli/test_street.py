@@ -8,8 +8,11 @@ import numpy as np
 import pytest
 
 from splatseg.io.scans import read_scans
+from splatseg.io.scene import load_scene
 from splatseg.street.files import load_mesh_field
+from splatseg.tasks import scans_to_label, street_scene
 from support.arrays import arrays_of
+from support.elsewhere import Elsewhere
 from support.ply import write_ply
 
 FAST = ("--voxels", "2.0", "4.0", "--geometry-iterations", "1", "--iterations", "3", "--rays", "64")
@@ -79,6 +82,14 @@ def test_scans_are_labelled_by_the_field(made, generated_drive, splatseg, tmp_pa
     first = scans.scan(scans.scan_names[0])
     ids = field.labels_at(first.points, "labels_semantic").ids
     assert (found["vertices"][0] > 0).sum() == int((ids > 0).sum())
+
+
+def test_scans_are_labelled_where_the_executor_is(made, generated_drive, tmp_path) -> None:
+    executor, out = Elsewhere(), tmp_path / "out"
+    scans = scans_to_label(generated_drive, out)
+    street_scene(load_scene(made), scans=scans, labels=out, by="vertices", executor=executor)
+    assert executor.items == list(scans.scan_names)
+    assert (out / "labels.npz").is_file()
 
 
 def test_eq_9_is_asked_as_published_of_a_field_that_is_there(
