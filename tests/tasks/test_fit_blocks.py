@@ -204,6 +204,8 @@ def test_the_command_line(small_room, straight, tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)["blocks"] == 1
     assert main([*words, "-o", str(tmp_path / "whole"), "--json"]) == 0
     assert "blocks" not in json.loads(capsys.readouterr().out)
+    assert main([*words, "-o", str(tmp_path / "small"), "--longest", "24", "--json"]) == 0
+    assert load_scene(tmp_path / "small").provenance["options"]["longest"] == 24
     for wrong in ("0", "6", "many"):
         assert main([*words, "-o", str(tmp_path / "wrong"), "--blocks", wrong]) == 2
         assert "blocks" in capsys.readouterr().err

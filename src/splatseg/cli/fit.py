@@ -68,6 +68,10 @@ class Command(Printing):
     """Largest number of Gaussians of the scene. None takes the preset's, times the square root of
     how much longer than the preset the fit is."""
 
+    longest: Annotated[int, tyro.conf.arg(metavar="PIXELS")] = _DEFAULT.longest
+    """Photographs whose longest side has more pixels are reduced to it. Half of it makes steps
+    nearly four times as fast, and what is smaller than a pixel is lost."""
+
     preset: Preset = "default"
     """quick: 3 minutes, 274 000 Gaussians. default: 10 minutes, 500 000. full: the published
     settings, 30 000 steps, up to a million Gaussians, spherical harmonics of degree 3."""
@@ -147,6 +151,7 @@ def _options(command: Command) -> FitOptions:
     options = replace(
         options,
         seed=command.seed,
+        longest=command.longest,
         start=command.start,
         background=command.background,
         prune_floaters=command.prune_floaters,
