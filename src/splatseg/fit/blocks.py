@@ -48,9 +48,6 @@ _LITTLE_SHARE = 0.02
 four rooms a quarter leaves the surfaces at borders 1 dB worse, a tenth of this makes no difference
 but of cost."""
 
-REFINED = 0.2
-"""Steps of that refinement, of those of a fit. A tenth leaves borders 0.5 dB worse."""
-
 _MINUTES = 0.75
 """Part of `FitOptions.minutes` that is left for the fits of blocks: views of the refinement are up
 to half as many again, and its steps have all Gaussians."""

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from splatseg.core import (
     LOCAL,
@@ -20,7 +20,7 @@ from splatseg.core.boundary import boundary
 from splatseg.core.options import options as options_class
 from splatseg.errors import InputError
 from splatseg.io.export import ScanLabelCounts, ScanLabelForm, check_replaceable, write_scan_labels
-from splatseg.io.scans import Scans, read_scans
+from splatseg.io.scans import LastResult, Scans, read_scans
 from splatseg.lift.viewed_points import ViewedPointOptions, ViewedPoints
 from splatseg.render import BackendName
 from splatseg.street.block_field import DriveField, labels_of_scans
@@ -173,21 +173,12 @@ class _Kept:
     """Scans of which the last that was read is kept: its labels are written in its order."""
 
     def __init__(self, scans: ScanSource) -> None:
-        self._scans = scans
-        self._last: Scan | None = None
-
-    def __getstate__(self) -> dict[str, Any]:
-        """What another process gets: it reads scans itself."""
-        return {"_scans": self._scans, "_last": None}
-
-    @property
-    def scan_names(self) -> tuple[str, ...]:
-        return tuple(self._scans.scan_names)
+        self.scan_names = tuple(scans.scan_names)
+        self._read = LastResult(scans.scan)
 
     def scan(self, name: str) -> Scan:
-        if self._last is None or self._last.name != name:
-            self._last = self._scans.scan(name)
-        return self._last
+        """One of them."""
+        return self._read(name)
 
 
 def _told(

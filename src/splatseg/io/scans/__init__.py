@@ -16,6 +16,7 @@ from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, MissingFileError
 from splatseg.io.captures.kitti360 import window_of
 from splatseg.io.scans import files, kitti, kitti360, waymo
+from splatseg.io.scans._source import LastResult as LastResult
 from splatseg.io.scans._source import Scans as Scans
 
 
