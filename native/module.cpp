@@ -22,6 +22,7 @@ void register_retrieve(nb::module_& m);
 void register_row_products(nb::module_& m);
 void register_view(nb::module_& m);
 void register_voxels(nb::module_& m);
+void register_watershed(nb::module_& m);
 }  // namespace splatseg
 
 NB_MODULE(_native, m) {
@@ -51,4 +52,5 @@ NB_MODULE(_native, m) {
   register_retrieve(m);
   register_row_products(m);
   register_voxels(m);
+  register_watershed(m);
 }

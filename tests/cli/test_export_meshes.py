@@ -1,6 +1,7 @@
 """export --what meshes: a ball of Gaussians on a floor, as the shell runs it."""
 
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -153,8 +154,10 @@ def test_mistakes_get_one_sentence(scene, splatseg, tmp_path, monkeypatch) -> No
         assert status == 2, (arguments, err)
         assert word in err, (arguments, err)
         assert "Traceback" not in err
-    monkeypatch.setitem(__import__("sys").modules, "coacd", None)
-    status, _, err = splatseg("export", scene, *ONLY, "--hulls", *out)
-    assert status != 0
-    assert "splatseg[mesh]" in err
+    for package in ("coacd", "skimage"):
+        with monkeypatch.context() as patched:
+            patched.setitem(sys.modules, package, None)
+            status, _, err = splatseg("export", scene, *ONLY, "--hulls", *out)
+        assert status != 0
+        assert f"({package}). Try: pip install 'splatseg[mesh]'" in err
     assert sorted(tmp_path.rglob("*")) == before

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -119,7 +120,9 @@ def test_eq_9_is_asked_as_published_of_a_field_that_is_there(
     assert "scans labelled by vertices (those that training adjusted, as published)" in out
 
 
-def test_what_is_wrong_is_one_sentence(made, generated_drive, splatseg, tmp_path) -> None:
+def test_what_is_wrong_is_one_sentence(
+    made, generated_drive, splatseg, tmp_path, monkeypatch
+) -> None:
     def refused(*words: object) -> str:
         status, out, err = splatseg("street", *words, "--quiet")
         assert (status, out, err.count("\n")) == (2, "", 1), err
@@ -151,6 +154,10 @@ def test_what_is_wrong_is_one_sentence(made, generated_drive, splatseg, tmp_path
     )
     (tmp_path / "lidar.npz").write_bytes(b"half")
     assert "lidar.npz" in refused(made, "--label-scans", tmp_path, "-o", out, *unmade)
+    with monkeypatch.context() as patched:
+        patched.setitem(sys.modules, "sklearn.ensemble", None)
+        status, _, err = splatseg("street", made, *mesh, "--field", "b", *FAST, "--quiet")
+        assert (status, err.count("pip install 'splatseg[street]'")) == (1, 1), err
     assert not (made / "fields/b.safetensors").exists()
     # Half a file, as a disk that was full would leave it.
     root = shutil.copytree(made, tmp_path / "half")

@@ -1,6 +1,7 @@
 """Points of a field of any kind, seen by its views, and told by their shapes where none sees."""
 
 import pickle
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -9,7 +10,7 @@ import torch
 
 from lift.conftest import camera_at
 from splatseg.core import Camera, Renderable, Scan
-from splatseg.errors import InputError, RangeError, ShapeError
+from splatseg.errors import InputError, MissingPackageError, RangeError, ShapeError
 from splatseg.lift import point_shapes, viewed_points
 from splatseg.lift.viewed_points import (
     PointView,
@@ -211,6 +212,13 @@ def test_all_else_is_the_fields_own() -> None:
 
 def test_no_points_have_no_labels() -> None:
     assert told(replace(PLAIN, shapes=True, smoothing_steps=2), torch.zeros(0, 3)) == []
+
+
+def test_shapes_need_an_extra(monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "sklearn.ensemble", None)
+    viewed(options=replace(PLAIN, shapes=False))
+    with pytest.raises(MissingPackageError, match=r"pip install 'splatseg\[street\]'"):
+        viewed(options=replace(PLAIN, shapes=True))
 
 
 def test_bad_input_is_refused() -> None:

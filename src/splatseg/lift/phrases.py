@@ -26,7 +26,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
@@ -53,6 +52,16 @@ _GROWN = 0.1
 
 _NEAR = 0.25
 """Share of a thing's diagonal within which others are near it."""
+
+_XYZ = torch.tensor(
+    [
+        [0.412453, 0.357580, 0.180423],
+        [0.212671, 0.715160, 0.072169],
+        [0.019334, 0.119193, 0.950227],
+    ],
+    dtype=torch.float64,
+)
+"""Linear sRGB to CIE XYZ; white, (1, 1, 1), is that of D65."""
 
 _COLOURS: dict[str, tuple[int, int, int]] = {
     "black": (20, 20, 20), "white": (240, 240, 240), "grey": (128, 128, 128),
@@ -152,10 +161,15 @@ def colour_of(called: str) -> tuple[float, float, float] | None:
 
 
 def _lab(colours: Float[Tensor, "k 3"]) -> Float[Tensor, "k 3"]:
-    """CIELAB of sRGB in [0, 1]."""
-    from skimage.color import rgb2lab
-
-    return torch.from_numpy(np.asarray(rgb2lab(colours.double().numpy()), np.float32))
+    """CIELAB of sRGB in [0, 1], under the white of D65 (IEC 61966-2-1, CIE 15)."""
+    srgb = colours.double()
+    linear = torch.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    x, y, z = (linear @ _XYZ.T / _XYZ.sum(dim=1)).unbind(1)
+    fx, fy, fz = (
+        torch.where(t > (6 / 29) ** 3, t.clamp_min(0) ** (1 / 3), t * (29 / 6) ** 2 / 3 + 4 / 29)
+        for t in (x, y, z)
+    )
+    return torch.stack((116 * fy - 16, 500 * (fx - fy), 200 * (fy - fz)), dim=1).float()
 
 
 def colour_distances(

@@ -26,6 +26,7 @@ References:
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -34,6 +35,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splatseg.core.threads import caller_threads
+from splatseg.errors import import_package
 from splatseg.neighbours import NeighbourIndex
 
 _STEPS = 4096
@@ -349,6 +351,15 @@ def drawn(samples: Sequence[ShapeSamples], per_label: int) -> ShapeSamples:
     )
 
 
+def forest_package() -> Any:
+    """What grows the trees.
+
+    Raises:
+        MissingPackageError: If the extra `street` is not installed.
+    """
+    return import_package("sklearn.ensemble", "labels of points by their shapes", "street")
+
+
 class ShapeForest:
     """Trees that tell from a shape what it is called.
 
@@ -359,14 +370,12 @@ class ShapeForest:
     """
 
     def __init__(self, samples: ShapeSamples, *, trees: int, seed: int) -> None:
-        from sklearn.ensemble import ExtraTreesClassifier
-
         labels = samples.labels.numpy()
         present = np.bincount(labels, minlength=len(samples.totals))
         # Each label counts as often as it came, though only some of its points were kept.
         share = samples.totals.numpy() / np.maximum(present, 1)
         self._labels = len(samples.totals)
-        self._forest = ExtraTreesClassifier(
+        self._forest = forest_package().ExtraTreesClassifier(
             n_estimators=trees,
             min_samples_leaf=_MIN_LEAF,
             random_state=seed,

@@ -50,6 +50,7 @@ from splatseg.lift.point_shapes import (
     ShapeSamples,
     Thinned,
     drawn,
+    forest_package,
     local_shapes,
     smoothed,
     thin,
@@ -257,6 +258,7 @@ class ViewedPoints:
 
     Raises:
         InputError: If there are no cameras.
+        MissingPackageError: If shapes are asked for without the extra `street`.
         RangeError: If up or the unit is no length.
     """
 
@@ -280,6 +282,8 @@ class ViewedPoints:
         self._field = field
         self._cameras = tuple(cameras)
         self._options = options or ViewedPointOptions()
+        if self._options.shapes:  # refused before the views are drawn, not after
+            forest_package()
         self._unit = metres_per_unit
         self._drawn: OrderedDict[tuple[str, int], PointView] = OrderedDict()
 

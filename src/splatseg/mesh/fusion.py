@@ -22,7 +22,7 @@ of the object also where none looks as far as a voxel behind its surface.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splatseg.core.boundary import boundary
-from splatseg.errors import InputError
+from splatseg.errors import InputError, import_package
 from splatseg.io.export import TriangleMesh
 from splatseg.mesh.maps import ViewMaps
 
@@ -281,11 +281,10 @@ def _pieces(inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 def _isosurface(distances: Array, grid: Grid) -> TriangleMesh:
     """Marching cubes at 0, with one more layer of voxels that are outside."""
-    from skimage.measure import marching_cubes
-
+    measure: Any = import_package("skimage.measure", "a surface", "mesh")
     padded = np.pad(distances, 1, constant_values=1.0)
     # The inside is below 0: skimage calls that ascending, seen along the triangles' normals.
-    vertices, faces, _, _ = marching_cubes(padded, 0.0, gradient_direction="descent")
+    vertices, faces, _, _ = measure.marching_cubes(padded, 0.0, gradient_direction="descent")
     return TriangleMesh(
         vertices=torch.from_numpy(grid.to_world(vertices.astype(np.float64) - 1)),
         faces=torch.from_numpy(faces.astype(np.int64)),

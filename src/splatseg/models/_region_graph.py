@@ -142,10 +142,10 @@ def _gradient(lab: Array, sigma: float) -> Array:
 def _basins(ridge: Array) -> NDArray[np.int64]:
     """Watershed basins of a map, one from each plateau that is least in its window."""
     from scipy import ndimage
-    from skimage.segmentation import watershed
 
-    bottoms, _ = ndimage.label(ndimage.minimum_filter(ridge, _WINDOW) == ridge)  # pyright: ignore[reportGeneralTypeIssues]
-    return np.asarray(watershed(ridge, bottoms)).astype(np.int64) - 1
+    basins, _ = ndimage.label(ndimage.minimum_filter(ridge, _WINDOW) == ridge)  # pyright: ignore[reportGeneralTypeIssues]
+    _native.watershed(ridge, basins)
+    return basins.astype(np.int64) - 1
 
 
 PART, THING = 0, 1

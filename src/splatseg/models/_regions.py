@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from splatseg import _native
 from splatseg.core import UNLABELLED, LabelMap, MaskSet, Rle
 from splatseg.core.boundary import boundary
 from splatseg.core.models import Image
@@ -141,7 +142,6 @@ def reduced(image: Image, longest: int) -> NDArray[np.uint8]:
 def _superpixels(strength: NDArray[np.float32], size: int) -> NDArray[np.int32]:
     """Watershed basins from the least strength of each cell, numbered 0..n-1 by row."""
     import cv2
-    from skimage.segmentation import watershed
 
     smooth = np.asarray(cv2.GaussianBlur(strength, (0, 0), 1.0, borderType=cv2.BORDER_REFLECT))
     height, width = smooth.shape
@@ -155,7 +155,8 @@ def _superpixels(strength: NDArray[np.float32], size: int) -> NDArray[np.int32]:
             lowest = int(cell.argmin())
             number += 1
             markers[y0 + lowest // cell.shape[1], x0 + lowest % cell.shape[1]] = number
-    return (np.asarray(watershed(smooth, markers)) - 1).astype(np.int32)
+    _native.watershed(smooth, markers)
+    return markers - 1
 
 
 def _cut_nodes(tree: MergeTree, options: ClassicalOptions) -> tuple[list[int], list[int]]:

@@ -205,12 +205,12 @@ class FeatureMembership:
 
     def _centres(self, values: Float[Tensor, "p d"]) -> Float[Tensor, "q d"]:
         """Centres of k-means."""
-        from sklearn.cluster import KMeans
+        from scipy.cluster.vq import kmeans2
 
         count = min(_CLUSTERS, len(np.unique(values.numpy(), axis=0)))
-        made = KMeans(n_clusters=count, random_state=self._options.seed)
-        made.fit(values.double().numpy())
-        return torch.from_numpy(made.cluster_centers_).float()
+        rng = np.random.default_rng(self._options.seed)
+        centres, _ = kmeans2(values.double().numpy(), count, minit="++", seed=rng)
+        return torch.from_numpy(centres).float()
 
 
 def _around(found: Tensor, limit: float, *, low: float, high: float) -> Tensor:

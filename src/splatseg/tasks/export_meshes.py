@@ -92,6 +92,7 @@ def _check_packages(job: ExportJob) -> None:
     """Refuse before the work what would fail after it."""
     for name, needed in (
         ("trimesh", True),
+        ("skimage", True),
         ("xatlas", job.options.mesh_format != "ply"),
         ("coacd", job.options.hulls),
     ):

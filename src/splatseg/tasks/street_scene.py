@@ -9,6 +9,7 @@ from splatseg.errors import InputError
 from splatseg.io.scans import Scans
 from splatseg.io.scene_fields import FOLDER, scene_field_names, scene_field_path
 from splatseg.io.scene_folder import work_on_scene
+from splatseg.lift.point_shapes import forest_package
 from splatseg.render import BackendName
 from splatseg.report.maps import LabelledPoints
 from splatseg.street.build import DnmpOptions
@@ -92,10 +93,13 @@ def street_scene(
     Raises:
         InputError: If scans and the folder of their labels do not come together, or something
             requested cannot be used.
+        MissingPackageError: If scans are to be labelled without the extra `street`.
     """
     options = options or StreetOptions()
     if (scans is None) != (labels is None):
         raise InputError("scans, labels: expected both or none, got one of the two.")
+    if scans is not None and by != "vertices":
+        forest_package()  # refused before a field is made, not after
     work = Work(scene=scene, backend=backend, observer=observer)
     field: Renderable | None = None
     made: StreetField | StreetDrive | None = None

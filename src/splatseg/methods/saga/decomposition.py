@@ -21,9 +21,11 @@ References:
     Ward, Hierarchical Grouping to Optimize an Objective Function (1963).
 """
 
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
-from itertools import pairwise
-from typing import Annotated, Any
+from heapq import heapify, heappop, heappush
+from itertools import pairwise, repeat
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -124,41 +126,55 @@ def ward(
         points: Where the samples are.
         increase: Delta that joining two clusters may cost.
     """
-    import scipy.sparse
-    from scipy.sparse.csgraph import connected_components
-
     count = len(directions)
     if count < 2:
         return np.zeros(count, dtype=np.int64)
     k = min(NEIGHBOURS, count - 1)
-    near = NeighbourIndex(points).nearest_others(k).indices.numpy()
-    edges = (np.ones(count * k), (np.repeat(np.arange(count), k), near.reshape(-1)))
-    graph: Any = scipy.sparse.csr_matrix(edges, shape=(count, count))
-    graph = graph.maximum(graph.T).tocsr()
-    _, piece = connected_components(graph, directed=False)
-    # scikit-learn's distance is sqrt(2 n Delta).
-    limit = float(np.sqrt(2 * count * increase))
-    values = directions.double().numpy()
-    cluster = np.zeros(count, dtype=np.int64)
-    after = 0
-    for rows in np.split(np.argsort(piece, kind="stable"), np.cumsum(np.bincount(piece))[:-1]):
-        cluster[rows] = after + _joined(values[rows], graph[rows][:, rows], limit)
-        after = int(cluster[rows].max()) + 1
-    _, first, found = np.unique(cluster, return_index=True, return_inverse=True)
-    return np.argsort(np.argsort(first))[found].astype(np.int64)
-
-
-def _joined(values: NDArray[np.float64], graph: Any, limit: float) -> NDArray[np.int64]:
-    """Clusters of what one graph connects."""
-    if len(values) < 2:
-        return np.zeros(len(values), dtype=np.int64)
-    from sklearn.cluster import AgglomerativeClustering
-
-    by_distance: Any = None  # its annotation knows numbers only
-    made = AgglomerativeClustering(
-        n_clusters=by_distance, distance_threshold=limit, linkage="ward", connectivity=graph
+    near: list[set[int]] = [set() for _ in range(count)]
+    for i, others in enumerate(NeighbourIndex(points).nearest_others(k).indices.tolist()):
+        for j in others:
+            near[i].add(j)
+            near[j].add(i)
+    # Samples, then clusters in the order in which they were made.
+    means = np.concatenate(
+        [directions.double().numpy(), np.empty((count - 1, directions.shape[1]))]
     )
-    return made.fit_predict(values).astype(np.int64)
+    sizes = np.concatenate([np.ones(count), np.zeros(count - 1)])
+    joined_to = np.arange(2 * count - 1)
+
+    def joins(i: int, others: NDArray[np.int64]) -> Iterable[tuple[float, int, int]]:
+        squared = np.square(means[others] - means[i]).sum(axis=1)
+        cost = sizes[i] * sizes[others] / (sizes[i] + sizes[others]) / count * squared
+        allowed = cost < increase
+        return zip(cost[allowed].tolist(), repeat(i), others[allowed].tolist())
+
+    heap = [
+        join
+        for i in range(count)
+        for join in joins(i, np.array([j for j in near[i] if j < i], np.int64))
+    ]
+    heapify(heap)
+    made = count
+    while heap:
+        _, i, j = heappop(heap)
+        if joined_to[i] != i or joined_to[j] != j:
+            continue
+        sizes[made] = sizes[i] + sizes[j]
+        means[made] = (sizes[i] * means[i] + sizes[j] * means[j]) / sizes[made]
+        joined_to[[i, j]] = made
+        around = (near[i] | near[j]) - {i, j}
+        near[i] = near[j] = set()
+        near.append(around)
+        for other in around:
+            near[other] -= {i, j}
+            near[other].add(made)
+        for join in joins(made, np.array(sorted(around), np.int64)):
+            heappush(heap, join)
+        made += 1
+    for node in range(made - 1, -1, -1):
+        joined_to[node] = joined_to[joined_to[node]]
+    _, first, found = np.unique(joined_to[:count], return_index=True, return_inverse=True)
+    return np.argsort(np.argsort(first))[found].astype(np.int64)
 
 
 def votes(
