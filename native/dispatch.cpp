@@ -14,25 +14,29 @@ namespace splatseg {
 namespace {
 
 #if defined(SPLATSEG_HAS_X86)
-// Asked of the processor itself: __builtin_cpu_supports does not know "f16c" in clang 14.
-bool has_f16c() {
-  unsigned int eax = 0, ebx = 0, ecx = 0, edx = 0;
-  return __get_cpuid(1, &eax, &ebx, &ecx, &edx) != 0 && (ecx & bit_F16C) != 0;
+// Asked of the processor itself: __builtin_cpu_supports does not know "f16c" in clang 14, and in
+// the runtime of zig, which builds our wheels, it knows nothing.
+struct Features {
+  bool avx2 = false, avx512 = false;
+};
+
+Features features() {
+  unsigned int eax = 0, ebx = 0, ecx = 0, edx = 0, state = 0, high = 0;
+  constexpr unsigned int kNeeded = bit_OSXSAVE | bit_FMA | bit_F16C;
+  if (!__get_cpuid(1, &eax, &ebx, &ecx, &edx) || (ecx & kNeeded) != kNeeded) return {};
+  __asm__("xgetbv" : "=a"(state), "=d"(high) : "c"(0));  // registers that the system keeps
+  if (!__get_cpuid_count(7, 0, &eax, &ebx, &ecx, &edx)) return {};
+  constexpr unsigned int kWide = bit_AVX512F | bit_AVX512DQ | bit_AVX512BW | bit_AVX512VL;
+  const bool avx2 = (state & 0x06) == 0x06 && (ebx & bit_AVX2) != 0;
+  return {avx2, avx2 && (state & 0xe6) == 0xe6 && (ebx & kWide) == kWide};
 }
 #endif
 
 const Kernels* find(const char* name) {
 #if defined(SPLATSEG_HAS_X86)
-  __builtin_cpu_init();
-  if (!std::strcmp(name, "avx512"))
-    return __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") &&
-                   __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512vl")
-               ? &avx512::table()
-               : nullptr;
-  if (!std::strcmp(name, "avx2"))
-    return __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") && has_f16c()
-               ? &avx2::table()
-               : nullptr;
+  static const Features here = features();
+  if (!std::strcmp(name, "avx512")) return here.avx512 ? &avx512::table() : nullptr;
+  if (!std::strcmp(name, "avx2")) return here.avx2 ? &avx2::table() : nullptr;
 #endif
   return std::strcmp(name, "portable") ? nullptr : &portable::table();
 }
