@@ -1,4 +1,4 @@
-"""The models of docs/models.md as packages: installed with pip, found by see, run on a scene."""
+"""The models of docs/own-models.md as packages: installed with pip, found by see, run on a scene."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from splatseg.io.images import load_image
 from splatseg.io.scene import load_scene
 from support.packages import blocks, install, run
 
-PAGE = Path(__file__).parents[2] / "docs" / "models.md"
+PAGE = Path(__file__).parents[2] / "docs" / "own-models.md"
 
 
 def code_of(word: str) -> str:

@@ -1,4 +1,4 @@
-"""Models by name, those of other packages, and the ten lines of docs/models.md."""
+"""Models by name, those of other packages, and the ten lines of docs/own-models.md."""
 
 import re
 import sys
@@ -198,12 +198,12 @@ def my_network(monkeypatch) -> list[tuple[torch.Size, ...]]:
 def test_the_pointmaps_of_the_documentation_run(
     project_root: Path, my_network, installed, monkeypatch
 ) -> None:
-    text = (project_root / "docs" / "models.md").read_text(encoding="utf-8")
+    text = (project_root / "docs" / "own-models.md").read_text(encoding="utf-8")
     (block,) = (b for b in _python(text) if "class MyPointmaps" in b)
     lines = [line for line in block.splitlines() if line.strip()]
     assert sum(not line.startswith(("import", "from")) for line in lines) <= 10
     package = types.ModuleType("their_package")
-    exec(compile(block, "docs/models.md", "exec"), package.__dict__)
+    exec(compile(block, "docs/own-models.md", "exec"), package.__dict__)
     monkeypatch.setitem(sys.modules, "their_package", package)
     installed(**{"my-pointmaps": "their_package:MyPointmaps"})
     model = find_model("my-pointmaps")
@@ -240,13 +240,13 @@ def _python(text: str) -> list[str]:
 def test_the_models_of_the_documentation_run(
     project_root: Path, views, tmp_path, my_network
 ) -> None:
-    """The code of docs/models.md, the model in ten lines among it."""
-    text = (project_root / "docs" / "models.md").read_text(encoding="utf-8")
-    blocks = _python(text)
+    """The code of both pages of models, the model in ten lines among it."""
+    pages = [project_root / "docs" / page for page in ("own-models.md", "models.md")]
+    blocks = [block for page in pages for block in _python(page.read_text(encoding="utf-8"))]
     assert len(blocks) >= 2
     names: dict[str, object] = {}
     for block in blocks:
-        exec(compile(block, "docs/models.md", "exec"), names)
+        exec(compile(block, "docs/own-models.md", "exec"), names)
     model = names["BrightSide"]
     lines = next(b for b in blocks if "class BrightSide" in b).strip().splitlines()
     body = [line for line in lines if line.strip() and not line.startswith(("import", "from"))]
