@@ -12,7 +12,7 @@ from splatseg.methods.associate._clustering import Agreement, Nesting, nesting
 from splatseg.methods.associate._levels import GROUP, OBJECT, PART, separated_levels
 from splatseg.methods.associate._tree import SegmentTree
 
-GAUSSIANS = 24
+GAUSSIANS = 25
 EVERYTHING, SHELF = range(24), range(20)
 BOARDS = (range(10), range(10, 20))
 BOOKS = (range(20, 22), range(22, 24))
@@ -160,11 +160,26 @@ def test_what_lies_in_a_part_and_not_in_the_shelf_is_beside_the_shelf() -> None:
 
 
 def test_an_object_without_one_of_its_parts_is_nothing_and_is_not_divided() -> None:
-    # The parts that some masks leave out have no parts: no group.
-    tree, level = separated(shelf(), PARENTS, support=[1] * 5 + [0.1] * 4)
-    assert tree.parent.tolist() == PARENTS
-    assert level == [OBJECT] + [PART] * 8
+    # The two parts that some masks leave out have no parts: a group would cost 2 + 2 / 2.
+    masks = [one for one in shelf() if one[1] <= len(BOARDS) + len(BOOKS)]
+    tree, level = separated(masks, PARENTS[:5])
+    assert tree.parent.tolist() == PARENTS[:5]
+    assert level == [OBJECT] + [PART] * 4
     assert not tree.alone.any()
+
+
+@pytest.mark.parametrize(("books", "level"), [(4, OBJECT), (5, GROUP)])
+def test_many_that_masks_leave_out_are_no_parts(books: int, level: int) -> None:
+    # They are exceptions of an object, 4 or 5, and half as much as things without parts of a
+    # group, which costs 2: 4 or 4.5.
+    masks: Masks = []
+    for view in range(4):
+        masks += [(view, 0, (*SHELF, *range(20, 20 + books))), (view, 0, SHELF)]
+        masks += [(view, 1 + row, board) for row, board in enumerate(BOARDS)]
+        masks += [(view, 3 + row, (20 + row,)) for row in range(books)]
+    tree, levels = separated(masks, [-1] + [0] * (2 + books))
+    assert levels[0] == level
+    assert len(tree.parent) == 3 + books + (level == GROUP)
 
 
 def test_a_pane_that_is_one_node_with_its_window_is_a_part_of_it() -> None:

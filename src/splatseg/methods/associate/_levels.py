@@ -34,6 +34,7 @@ def node_levels(
     those with the fewest exceptions, each weighed by the support s of the node it is about:
 
     - a part that has parts, :math:`s` for each node below it;
+    - a part that masks of its whole leave out (`separated_levels`), :math:`s`;
     - an object in a group that has no parts, :math:`s / 2`: small things often show none, whereas
       parts are hardly ever divided;
     - a group, 2: a level more must explain more than two exceptions.
@@ -58,6 +59,8 @@ def node_levels(
         # An object without some of its parts is not a part: what it holds are parts.
         parts = [j for i in inner for j in (children[i] if tree.alone[i] else [i])]
         as_object[row] = below[parts].sum()
+        if any(tree.alone[i] for i in inner):  # the others are what masks of the whole leave out
+            as_object[row] += sum(tree.support[i] for i in inner if not tree.alone[i])
         lone = np.array([0.0 if children[i] else _LONE_COST * tree.support[i] for i in inner])
         best = np.minimum(as_object[inner] + lone, as_group[inner])
         if len(inner) > 1:
