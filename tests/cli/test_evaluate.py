@@ -172,7 +172,7 @@ def test_tables_and_a_file(labelled, splatseg, tmp_path) -> None:
         "--truth-instances", capture / "instance", "--json-file", tmp_path / "a.json", *CPU,
     )  # fmt: skip
     assert status == 0, err
-    for word in ("PQ_scene", "mAP50", "left wall", "SQ", "average precision"):
+    for word in ("PQ_scene", "mAP50", "left wall", "SQ", "average precision", " AP50"):
         assert word in text
     figures = json.loads((tmp_path / "a.json").read_text())
     assert figures["metric"] == "panoptic"

@@ -17,11 +17,12 @@ from splatseg.tasks.figures import check_table_file, write_class_table, write_co
 from splatseg.tasks.work import check_parent, scene_field
 
 _PER_CLASS = {
-    "per_class": "classes",
-    "PQ_per_class": "panoptic quality of each class",
-    "AP50_per_class": "average precision of each class of things",
-    "points_per_class": "classes of points",
+    "per_class": ("classes", "IoU"),
+    "PQ_per_class": ("panoptic quality of each class", "PQ"),
+    "AP50_per_class": ("average precision of each class of things", "AP50"),
+    "points_per_class": ("classes of points", "IoU"),
 }
+"""Title of each table, and what its one column of figures is."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,14 +98,14 @@ def _print_tables(figures: Mapping[str, Any], scene: Scene) -> None:
         if key not in ("scene", "split", "learned_from") and not isinstance(value, dict):
             table.add_row(key, plain(f"{value:.4f}" if isinstance(value, float) else value))
     console.print(table)
-    for key, title in _PER_CLASS.items():
+    for key, (title, measure) in _PER_CLASS.items():
         if key in figures:
             rows = figures[key]
             if key == "per_class" and "pixels_per_class" in figures:
                 pixels = figures["pixels_per_class"]
                 rows = {id: {"pixels": pixels[id], "IoU": iou} for id, iou in rows.items()}
             names = figures.get("names_per_class", {})
-            console.print(_class_table(rows, names, scene, title))
+            console.print(_class_table(rows, names, scene, title=title, measure=measure))
     if figures.get("learned_from"):
         console.print(
             f"The layer was made from {figures['learned_from']} of these views: "
@@ -113,11 +114,11 @@ def _print_tables(figures: Mapping[str, Any], scene: Scene) -> None:
 
 
 def _class_table(
-    rows: Mapping[str, Any], known: Mapping[str, str], scene: Scene, title: str
+    rows: Mapping[str, Any], known: Mapping[str, str], scene: Scene, *, title: str, measure: str
 ) -> Table:
     """One row a class; its figures are one value, or several by name."""
     first = next(iter(rows.values()), 0.0)
-    measures = tuple(first) if isinstance(first, dict) else ("IoU",)
+    measures = tuple(first) if isinstance(first, dict) else (measure,)
     table = Table("id", "class", *measures, title=title)
     for column in table.columns[2:]:
         column.justify = "right"
