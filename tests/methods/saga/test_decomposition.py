@@ -1,10 +1,12 @@
 """Decomposition of features whose clusters are known."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from sklearn.cluster import AgglomerativeClustering
 
 from splatseg import _native
 from splatseg.core import UNLABELLED, Features, Gaussians, InstanceTree, LayerInfo
@@ -303,6 +305,20 @@ def test_ward_by_hand(monkeypatch) -> None:
         found = ward(directions, points, increase=increase)
         # The nearest of the second is the first, of the third the second: a path of all.
         assert found.tolist() == expected
+
+
+@pytest.mark.parametrize("increase", [0.03, 0.05, 0.08])
+def test_ward_is_that_of_scikit_learn(increase: float) -> None:
+    """All others are near to each, so that joins cost more and more, and cutting is stopping."""
+    generator = torch.Generator().manual_seed(3)
+    directions = torch.nn.functional.normalize(torch.randn(13, 5, generator=generator), dim=1)
+    limit = float(np.sqrt(2 * 13 * increase))  # its distance is sqrt(2 n Delta)
+    by_distance: Any = None
+    other = AgglomerativeClustering(n_clusters=by_distance, distance_threshold=limit)
+    wanted = other.fit_predict(directions.double().numpy())
+    found = ward(directions, torch.randn(13, 3, generator=generator), increase=increase)
+    assert [[a == b for b in found] for a in found] == [[a == b for b in wanted] for a in wanted]
+    assert np.unique(found).tolist() == sorted(set(found.tolist()), key=found.tolist().index)
 
 
 def test_votes_by_hand(monkeypatch) -> None:
