@@ -1,7 +1,6 @@
 """Fixtures and settings that every test shares."""
 
 import os
-import shutil
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -9,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from filelock import FileLock
 from hypothesis import HealthCheck, settings
 
 from splatseg.methods import _method
 from splatseg.render.cpu import set_threads, threads
 from support import shared
 from support.drive import write_drive
+from support.once import made_once
 from support.products import reorder_all_products, reordered
 from support.room import write_room
 from support.scorer import SCORERS, Score
@@ -89,25 +88,6 @@ def rng() -> np.random.Generator:
 def shared_data() -> Path:
     """The folder of large scenes. Every test that takes it is marked `data`."""
     return SHARED.folder
-
-
-def made_once(
-    tmp_path_factory: pytest.TempPathFactory,
-    worker_id: str,
-    name: str,
-    make: Callable[[Path], None],
-) -> Path:
-    """A folder of this session that the workers of pytest-xdist share."""
-    base = tmp_path_factory.getbasetemp()
-    folder = (base if worker_id == "master" else base.parent) / "generated" / name
-    folder.parent.mkdir(exist_ok=True)
-    with FileLock(f"{folder}.lock"):
-        if not folder.is_dir():
-            unfinished = folder.with_name(f"{name}-unfinished")
-            shutil.rmtree(unfinished, ignore_errors=True)
-            make(unfinished)
-            unfinished.rename(folder)
-    return folder
 
 
 @pytest.fixture(scope="session")

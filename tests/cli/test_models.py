@@ -1,4 +1,4 @@
-"""The models of docs/own-models.md as packages: installed with pip, found by see, run on a scene."""
+"""The models of docs/own-models.md as packages: installed by pip, found by see, run on a scene."""
 
 from pathlib import Path
 

@@ -62,7 +62,6 @@ def test_tables_are_medians_with_their_spread(project: Path) -> None:
     assert "\n\nbetween\n\n" in text
     assert "| `two` | mIoU |  | 0.250 |  / 31 | abc 2026-11-28 |" in text
     assert "Measured on: P, Python 3.11, torch 2.13." in text
-    assert "# one: one\nsplatseg a\nsplatseg b\n# two: two\nsplatseg c\n```" in text
     assert (project / "README.md").read_text() == "Without tables.\n"
 
 

@@ -32,14 +32,16 @@ class Seen:
     part: np.ndarray
 
 
-def write_all(folder: Path, scene: SyntheticScene, seen: Mapping[str, Seen]) -> None:
+def write_all(
+    folder: Path, scene: SyntheticScene, seen: Mapping[str, Seen], *, text_stride: int = 8
+) -> None:
     """Evidence of every kind for these views into a capture's folder."""
     write_panoptic(folder / "labels_panoptic", scene, seen)
     write_tracked(folder / "labels_tracked", scene, seen)
     write_overlapping_masks(folder / "masks_sam", seen)
     write_nested_masks(folder / "masks_nested", scene, seen)
     write_dino(folder / "features_dino", seen)
-    write_text(folder, scene, seen)
+    write_text(folder, scene, seen, stride=text_stride)
 
 
 def save_ids(path: Path, ids: np.ndarray) -> None:
@@ -208,7 +210,9 @@ def write_dino(folder: Path, seen: Mapping[str, Seen]) -> None:
         np.savez_compressed(folder / f"{name}.npz", f=np.stack([p[0][i] for p in parts]))
 
 
-def write_text(folder: Path, scene: SyntheticScene, seen: Mapping[str, Seen]) -> None:
+def write_text(
+    folder: Path, scene: SyntheticScene, seen: Mapping[str, Seen], *, stride: int = 8
+) -> None:
     """Vectors of words, and pixels' vectors near them as coefficients of a common basis."""
     rng = np.random.default_rng(5)
     names = class_names(scene)
@@ -217,7 +221,7 @@ def write_text(folder: Path, scene: SyntheticScene, seen: Mapping[str, Seen]) ->
     # Cells of class 0 (nothing) get the vector of row 0, which is no word.
     dense = {}
     for name, view in seen.items():
-        clean = words[_cells(view.semantic, 8)]
+        clean = words[_cells(view.semantic, stride)]
         noisy = clean + rng.normal(scale=0.05, size=clean.shape)
         dense[name] = noisy / np.linalg.norm(noisy, axis=-1, keepdims=True)
     stacked = np.concatenate([values.reshape(-1, WIDTH_OF_WORDS) for values in dense.values()])
@@ -228,7 +232,7 @@ def write_text(folder: Path, scene: SyntheticScene, seen: Mapping[str, Seen]) ->
     (folder / "features_text").mkdir()
     np.savez(
         folder / "features_text" / "basis.npz",
-        mean=mean.astype(np.float32), basis=basis, scale=scale, offset=offset, stride=8,
+        mean=mean.astype(np.float32), basis=basis, scale=scale, offset=offset, stride=stride,
     )  # fmt: skip
     for i, name in enumerate(dense):
         np.savez_compressed(folder / "features_text" / f"{name}.npz", f=codes[i])
