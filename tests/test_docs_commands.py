@@ -75,6 +75,9 @@ YOURS: Sequence[tuple[str, str]] = (
     # Words, and what dots and placeholders stand for.
     (r'"brown chair"', "chair"),
     (r"car pedestrian", "car person"),
+    # By the published settings a few random points, whose Gaussians other views of so few pixels
+    # need not show; of a ceiling they do.
+    (r'(--method prompt .*--words) (mug|"red mug")', r"\1 ceiling"),
     (r"COMMAND", "fit"),
     (r"^select SCENE$", "select SCENE --point front:200,150"),
     (r"^query SCENE$", "query SCENE mug"),
@@ -114,7 +117,7 @@ BEFORE: Mapping[str, Sequence[str]] = {
         "segment street --method uplift --evidence labels_semantic",
     ),
     "splatseg fit DATA -o SCENE --resume": (
-        "fit DATA -o SCENE --steps 30 --max-gaussians 600 --keep-checkpoint --overwrite",
+        "fit DATA -o SCENE --steps 20 --max-gaussians 500 --keep-checkpoint --overwrite",
     ),
     "splatseg segment NEW ... --update": ("see NEW --model regions --evidence masks",),
     "splatseg see OTHER --model frames": (

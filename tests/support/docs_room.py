@@ -7,6 +7,7 @@ in a pot: the phrases of the pages mean something in it, so that they need no ot
 import math
 import shutil
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -106,9 +107,10 @@ def write_room_capture(folder: Path) -> None:
             )
     recorded.write_all(folder, scene, seen, text_stride=4)
     shutil.copytree(folder / "labels_semantic", folder / "labels_semantic_hard")
-    # Of so few views none lacks a mask: a phrase is looked for in half of them.
+    # Of so few views none lacks a mask, and no group of things has one.
     shutil.rmtree(folder / "masks_sam")
-    recorded.write_nested_masks(folder / "masks_sam", scene, seen)
+    alone = replace(scene, objects=tuple(replace(one, parent=None) for one in scene.objects))
+    recorded.write_nested_masks(folder / "masks_sam", alone, seen)
 
 
 def _halves(instance: np.ndarray) -> np.ndarray:
@@ -166,21 +168,21 @@ def _shell(b: Builder) -> None:
 
 
 def _desk(b: Builder) -> None:
-    """A desk with a red mug, a laptop and a lamp, from left to right."""
+    """A desk with a red mug, a laptop and a lamp, from left to right, large for so few pixels."""
     wood = _texture(_WOOD, "wood", 0.2)
     desk = b.object("desk", "desk", at=(-0.3, 1.2, 0.0), parent=2)
     b.solid("box", (0.0, 0.0, 0.65), (1.2, 0.45, 0.05), wood)
     b.legs(1.1, 0.35, 0.6, 0.07, wood)
     b.object("mug", "red mug", at=(-1.1, 1.1, 0.7), parent=desk)
     red = Texture(palette=((0.75, 0.05, 0.05),) * 3, glow=1.0)
-    b.solid("cylinder", (0.0, 0.0, 0.28), (0.26, 0.26, 0.28), red)
-    b.object("laptop", "laptop", at=(-0.3, 1.2, 0.7), parent=desk)
-    b.solid("box", (0.0, 0.0, 0.03), (0.30, 0.25, 0.03), _texture((0.20, 0.20, 0.22)))
-    b.solid("box", (0.0, 0.25, 0.25), (0.30, 0.03, 0.22), _texture((0.30, 0.35, 0.50)))
+    b.solid("cylinder", (0.0, 0.0, 0.36), (0.35, 0.35, 0.36), red)
+    b.object("laptop", "laptop", at=(-0.25, 1.2, 0.7), parent=desk)
+    b.solid("box", (0.0, 0.0, 0.03), (0.36, 0.25, 0.03), _texture((0.20, 0.20, 0.22)))
+    b.solid("box", (0.0, 0.25, 0.30), (0.36, 0.03, 0.30), _texture((0.30, 0.35, 0.50)))
     b.object("lamp", "desk lamp", at=(0.6, 1.2, 0.7), parent=desk)
-    b.solid("cylinder", (0.0, 0.0, 0.2), (0.06, 0.06, 0.2), _texture((0.3, 0.3, 0.3)))
+    b.solid("cylinder", (0.0, 0.0, 0.2), (0.07, 0.07, 0.2), _texture((0.3, 0.3, 0.3)))
     shade = _texture((0.95, 0.85, 0.40), "stripes", 0.15)
-    b.solid("cylinder", (0.0, 0.0, 0.5), (0.25, 0.25, 0.15), shade, taper=0.6)
+    b.solid("cylinder", (0.0, 0.0, 0.6), (0.36, 0.36, 0.25), shade, taper=0.7)
 
 
 def _chair(b: Builder, name: str, *, at: Vector, colour: Vector) -> None:

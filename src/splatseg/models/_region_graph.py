@@ -143,7 +143,8 @@ def _basins(ridge: Array) -> NDArray[np.int64]:
     """Watershed basins of a map, one from each plateau that is least in its window."""
     from scipy import ndimage
 
-    basins, _ = ndimage.label(ndimage.minimum_filter(ridge, _WINDOW) == ridge)  # pyright: ignore[reportGeneralTypeIssues]
+    bottoms, _ = ndimage.label(ndimage.minimum_filter(ridge, _WINDOW) == ridge)  # pyright: ignore[reportGeneralTypeIssues]
+    basins = np.asarray(bottoms, np.int32)
     _native.watershed(ridge, basins)
     return basins.astype(np.int64) - 1
 

@@ -143,7 +143,9 @@ def _superpixels(strength: NDArray[np.float32], size: int) -> NDArray[np.int32]:
     """Watershed basins from the least strength of each cell, numbered 0..n-1 by row."""
     import cv2
 
-    smooth = np.asarray(cv2.GaussianBlur(strength, (0, 0), 1.0, borderType=cv2.BORDER_REFLECT))
+    smooth = np.asarray(
+        cv2.GaussianBlur(strength, (0, 0), 1.0, borderType=cv2.BORDER_REFLECT), np.float32
+    )
     height, width = smooth.shape
     rows = np.linspace(0, height, max(1, round(height / size)) + 1).astype(int)
     columns = np.linspace(0, width, max(1, round(width / size)) + 1).astype(int)

@@ -18,7 +18,7 @@ deviation.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -205,11 +205,12 @@ class FeatureMembership:
 
     def _centres(self, values: Float[Tensor, "p d"]) -> Float[Tensor, "q d"]:
         """Centres of k-means."""
-        from scipy.cluster.vq import kmeans2
+        from scipy.cluster import vq
 
         count = min(_CLUSTERS, len(np.unique(values.numpy(), axis=0)))
         rng = np.random.default_rng(self._options.seed)
-        centres, _ = kmeans2(values.double().numpy(), count, minit="++", seed=rng)
+        kmeans: Any = vq.kmeans2  # `seed` of old releases is hidden in new ones
+        centres, _ = kmeans(values.double().numpy(), count, minit="++", seed=rng)
         return torch.from_numpy(centres).float()
 
 
