@@ -33,7 +33,7 @@ PACKAGES = ("imageio", "laspy", "pycolmap", "ray", "transformers", "trimesh", "u
 """Of extras that the pages tell to install."""
 
 FEW = "--steps 30 --max-gaussians 500"
-FAST = "--voxels 4.0 --geometry-iterations 1 --iterations 3 --rays 64"
+FAST = "--voxels 8.0 --geometry-iterations 1 --iterations 3 --rays 64"
 
 SHORTER: Sequence[tuple[str, str]] = (
     (r"--steps \d+( --max-gaussians \d+)?", FEW),
@@ -106,7 +106,7 @@ APPENDED: Sequence[tuple[str, str]] = (
     (r"bench ", "--steps 30 --max-gaussians 400"),
     (r"bench cosseg-replica(?!.*--scenes)", "--scenes room_0"),
     (r"bench cosseg-scannet(?!.*--scenes)", "--scenes scene0010_00"),
-    (r"bench .*dnmp", "--option voxels=4.0 geometry_iterations=1 iterations=3 rays=64"),
+    (r"bench .*dnmp", "--option voxels=8.0 geometry_iterations=1 iterations=3 rays=64"),
     (r"bench .*identity", "--option steps=4"),
 )
 """What a command gets besides, so that it takes a second or downloads nothing."""

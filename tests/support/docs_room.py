@@ -28,7 +28,7 @@ VIEWS = (
 """From left to right, under names that the pages have."""
 
 _PHOTOGRAPHS = 8
-_PHOTOGRAPH_WIDTH, _PHOTOGRAPH_HEIGHT = 112, 84
+_PHOTOGRAPH_WIDTH, _PHOTOGRAPH_HEIGHT = 96, 72
 """Of photographs without cameras: with so many pixels structure from motion places all of them."""
 
 _LATER = 2

@@ -73,11 +73,14 @@ DATA_SETS: Mapping[str, str] = {
 }  # fmt: skip
 """Layouts of benchmarks, and the name of the scene of each."""
 
+THINNED = ("left", "train_0010", "test_0008")
+"""Left out of the data set that networks look at again and again."""
+
 FEW = ("left", "front", "train_0012")
 """Views whose photographs a network of pointmaps is asked about."""
 
 _ERRORS = PointmapErrors(noise=0.01)
-_FIT = ("--steps", "300", "--max-gaussians", "1500")
+_FIT = ("--steps", "200", "--max-gaussians", "1500")
 
 
 def furnish(folder: Path, world: Path, lines: Iterable[str]) -> None:
@@ -290,6 +293,8 @@ def write_data_sets(folder: Path, capture: Path, drive: Path) -> None:
         source = shutil.copytree(
             drive if layout in ("kitti360", "waymo") else capture, folder / "sources" / name
         )
+        if layout == "spin-nerf":
+            _leave_out(source, THINNED)
         write_layout(layout, source, folder / layout)
     scan = folder / "scannet" / "scans"
     (scan / "scene0000_00").rename(scan / DATA_SETS["scannet"])
@@ -300,3 +305,15 @@ def write_data_sets(folder: Path, capture: Path, drive: Path) -> None:
     (folder / "TRACKS").mkdir()
     tracks.rename(folder / "TRACKS" / DATA_SETS["replica"])
     shutil.rmtree(folder / "sources")
+
+
+def _leave_out(capture: Path, names: Sequence[str]) -> None:
+    """Take photographs out of a capture."""
+    path = capture / "transforms.json"
+    content = json.loads(path.read_text())
+    files = {f"images/{name}.jpg" for name in names}
+    for key, value in content.items():
+        if key.endswith("_filenames"):
+            content[key] = [file for file in value if file not in files]
+    content["frames"] = [one for one in content["frames"] if one["file_path"] not in files]
+    path.write_text(json.dumps(content))
