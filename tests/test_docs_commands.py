@@ -29,7 +29,10 @@ PAGES = [
     *sorted(page for page in (ROOT / "docs").rglob("*.md") if "reference" not in page.parts),
 ]
 
-PACKAGES = ("imageio", "laspy", "pycolmap", "ray", "transformers", "trimesh", "uvicorn")
+PACKAGES = (
+    "coacd", "h5py", "imageio_ffmpeg", "laspy", "pyarrow", "pycolmap", "ray", "sklearn",
+    "transformers", "trimesh", "uvicorn",
+)  # fmt: skip
 """Of extras that the pages tell to install."""
 
 FEW = "--steps 30 --max-gaussians 500"
