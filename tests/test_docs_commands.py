@@ -9,6 +9,7 @@ tables below, so that a new command of a page fails here until it can be run.
 import re
 import shlex
 import shutil
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from importlib.util import find_spec
@@ -151,6 +152,7 @@ RUN = {
 
 
 def page_name(page: Path) -> str:
+    """Its path, as the site has it."""
     return page.relative_to(ROOT).with_suffix("").as_posix().removeprefix("docs/")
 
 
@@ -206,9 +208,12 @@ def place(
     furnish(tmp_path, make("world"), map(shlex.join, commands))
     for name in WITHOUT.get(page.stem, ()):
         shutil.rmtree(tmp_path / name)
-    monkeypatch.syspath_prepend(make("world") / "installed")
+    packages = make("world") / "installed"
+    monkeypatch.syspath_prepend(packages)
     monkeypatch.chdir(tmp_path)
     with ExitStack() as stack:
+        for path in packages.glob("*.py"):  # other tests have packages of these names
+            stack.callback(sys.modules.pop, path.stem, None)
         if any(word.startswith("sets/") for words in commands for word in words):
             shutil.copytree(make("sets"), tmp_path / "sets")
         if any(map(names_a_network, commands)):
@@ -247,6 +252,16 @@ def test_pages_show_many() -> None:
     assert len(RUN) > 20
 
 
+def test_no_command_stands_within_a_line() -> None:
+    """Lines of an indented block that were filled like a paragraph are no commands any more."""
+    names = "|".join(cli.find_commands())
+    for page in PAGES:
+        text = re.sub(r"^```.*", "", page.read_text("utf-8"), flags=re.MULTILINE)
+        text = re.sub(r"`[^`]+`", "", text)
+        found = re.findall(rf"^.*\S.* splatseg (?:{names}) .*$", text, re.MULTILINE)
+        assert not found, page_name(page)
+
+
 def test_what_is_only_named_exists(capsys: pytest.CaptureFixture[str]) -> None:
     """Commands and flags that a sentence speaks of without showing a whole line."""
     mentions = [(page, one) for page, shown in SHOWN.items() for one in shown if one.mention]
@@ -263,7 +278,8 @@ def test_what_is_only_named_exists(capsys: pytest.CaptureFixture[str]) -> None:
 def test_no_row_of_the_tables_is_left_over() -> None:
     """What no page shows any more stands in no table."""
     shown = [one.line for commands in RUN.values() for one in commands]
-    assert all(any(line.startswith(start) for line in shown) for start in BEFORE)
+    for start in BEFORE:
+        assert any(line.startswith(start) for line in shown), start
     lines = [line.removeprefix("splatseg ") for line in shown]
     for pattern, replacement in (*YOURS, *SHORTER):
         assert any(re.search(pattern, line) for line in lines), pattern

@@ -1,8 +1,9 @@
 """The files that the pages of docs speak of, tiny: what a reader has when he begins.
 
 `write_world` makes them once, of the room of `support.docs_room` and by the commands themselves
-where commands make them. Names are those of the pages; `SCENES` and `CAPTURES` say which are the
-same. Networks have random weights, and lie in folders that are named as their repositories.
+where commands make them. Names are those of the pages; `NAMES` says which are the same. Networks
+have random weights, and lie in folders that are named as their repositories: an id that is a folder
+is read there.
 """
 
 import json
@@ -49,18 +50,18 @@ NAMES: Mapping[str, Sequence[str]] = {
 }
 """What pages call the scene of the room, its capture, and the drive."""
 
-SMALL: Mapping[str, int] = {"shortest_edge": 64, "longest_edge": 96}
-SQUARE: Mapping[str, int] = {"height": 64, "width": 64}
+_SMALL: Mapping[str, int] = {"shortest_edge": 64, "longest_edge": 96}
+_SQUARE: Mapping[str, int] = {"height": 64, "width": 64}
 
 WEIGHTS: Mapping[str, tuple[str, Mapping[str, int]]] = {
-    "CIDAS/clipseg-rd64-refined": ("clipseg", SQUARE),
-    "IDEA-Research/grounding-dino-tiny": ("grounding_dino", SMALL),
-    "depth-anything/Depth-Anything-V2-Small-hf": ("depth_anything", SQUARE),
+    "CIDAS/clipseg-rd64-refined": ("clipseg", _SQUARE),
+    "IDEA-Research/grounding-dino-tiny": ("grounding_dino", _SMALL),
+    "depth-anything/Depth-Anything-V2-Small-hf": ("depth_anything", _SQUARE),
     "facebook/dinov2-small": ("dinov2", {}),
-    "facebook/mask2former-swin-base-coco-panoptic": ("mask2former", SMALL),
+    "facebook/mask2former-swin-base-coco-panoptic": ("mask2former", _SMALL),
     "facebook/sam-vit-base": ("sam", {}),
     "facebook/sam2.1-hiera-small": ("sam2", {}),
-    "nvidia/segformer-b0-finetuned-ade-512-512": ("segformer", SQUARE),
+    "nvidia/segformer-b0-finetuned-ade-512-512": ("segformer", _SQUARE),
     "openai/clip-vit-base-patch16": ("clip", {}),
     "tue-mps/coco_panoptic_eomt_large_640": ("eomt", {}),
 }
@@ -182,8 +183,8 @@ def write_annotations(folder: Path, names: Sequence[str]) -> None:
     pixels[:, : WIDTH // 2] = 128, 0, 0
     for name in names:
         Image.fromarray(pixels).save(coloured / f"{name}.png")
-    names = "# label:color_rgb:parts:actions\nbackground:0,0,0::\nchair:128,0,0::\n"
-    (folder / "cvat-export" / "labelmap.txt").write_text(names)
+    table = "# label:color_rgb:parts:actions\nbackground:0,0,0::\nchair:128,0,0::\n"
+    (folder / "cvat-export" / "labelmap.txt").write_text(table)
 
 
 class KnowsTheRoom:
