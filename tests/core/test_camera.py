@@ -1,6 +1,7 @@
 """Cameras: projection by hand, inverses, and undistorted cameras that cover everything."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -107,6 +108,27 @@ def test_rays_point_at_what_projects_there(lens: Camera) -> None:
     pixels, _ = lens.project(along)
     torch.testing.assert_close(pixels, lens.pixel_centres(), atol=1e-7, rtol=0)
     torch.testing.assert_close(directions.norm(dim=-1), torch.ones(48, 64).double())
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"fx": 51.0},
+        {"cy": 24.0},
+        {"width": 60},
+        {"distortion": (0.2,)},
+        {"model": "thin_prism_fisheye"},
+    ],
+)
+def test_rays_of_all_pixels_are_of_this_lens(change: dict[str, object]) -> None:
+    """The plane of another lens, which is kept, is not taken for this one's; nor another pose."""
+    before = camera(model="opencv", distortion=(0.1,))
+    before.rays()
+    turned = EYE.clone()
+    turned[:3, :3] = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    for pose in (EYE, turned):
+        lens = replace(before, cam_from_world=pose, **change)  # pyright: ignore[reportArgumentType]
+        assert torch.equal(lens.rays()[1], lens.rays(lens.pixel_centres())[1])
 
 
 @pytest.mark.parametrize("lens", LENSES, ids=IDS)

@@ -2,6 +2,8 @@
 
 import math
 from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -16,6 +18,7 @@ from splatseg.core.rigid import Similarity, check_rotation
 from splatseg.errors import InputError, RangeError
 
 _MAX_UNDISTORTED_GROWTH = 8.0
+_OF_THE_LENS = ("width", "height", "fx", "fy", "cx", "cy", "model", "distortion")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -78,6 +81,17 @@ class Camera:
             )
         if not pose.requires_grad:
             object.__setattr__(self, "cam_from_world", pose.to(torch.float64))
+
+    @classmethod
+    def of_lens(cls, lens: tuple[Any, ...]) -> "Camera":
+        """The camera at the origin that has this `lens`, looking along z."""
+        fields = dict(zip(_OF_THE_LENS, lens, strict=True))
+        return cls(**fields, cam_from_world=torch.eye(4, dtype=torch.float64))
+
+    @property
+    def lens(self) -> tuple[Any, ...]:
+        """Everything but the pose. A key to what views of one camera share."""
+        return tuple(getattr(self, name) for name in _OF_THE_LENS)
 
     @property
     def is_pinhole(self) -> bool:
@@ -148,8 +162,9 @@ class Camera:
     ) -> tuple[Float[Tensor, "3"], Float[Tensor, "*batch 3"]]:
         """The centre and unit world directions of pixels; None is all centres, (H, W, 3)."""
         if pixels is None:
-            pixels = self.pixel_centres()
-        plane = self._plane_from_pixels(pixels)
+            plane = self._plane_of_all_pixels(self.lens)
+        else:
+            plane = self._plane_from_pixels(pixels)
         directions = torch.cat((plane, torch.ones_like(plane[..., :1])), -1)
         directions = directions / torch.linalg.vector_norm(directions, dim=-1, keepdim=True)
         pose = self.world_from_cam.to(directions)
@@ -249,6 +264,13 @@ class Camera:
 
     def _offset(self, like: Tensor) -> Tensor:
         return torch.tensor([self.cx, self.cy], dtype=like.dtype, device=like.device)
+
+    @staticmethod
+    @lru_cache(maxsize=2)
+    def _plane_of_all_pixels(lens: tuple[Any, ...]) -> Tensor:
+        """Where the rays of all pixels meet z = 1. Kept, as a distortion is slow to invert."""
+        camera = Camera.of_lens(lens)
+        return camera._plane_from_pixels(camera.pixel_centres())
 
     def _plane_from_pixels(self, pixels: Tensor) -> Tensor:
         plane = (pixels - self._offset(pixels)) / self._focal(pixels)

@@ -159,7 +159,7 @@ def undistorted_camera(camera: Camera) -> Camera:
     """The pinhole camera to draw for `camera`: it covers every pixel of the photograph."""
     if camera.is_pinhole:
         return replace(camera, model="pinhole", distortion=())
-    return replace(_cached_pinhole(_lens(camera)), cam_from_world=camera.cam_from_world)
+    return replace(_cached_pinhole(camera.lens), cam_from_world=camera.cam_from_world)
 
 
 def warp_into_photograph(camera: Camera, mode: WarpMode = "bilinear") -> Warp:
@@ -167,7 +167,7 @@ def warp_into_photograph(camera: Camera, mode: WarpMode = "bilinear") -> Warp:
 
     The last few are kept; they depend on the lens and the size, not on the pose.
     """
-    return _cached_warp(_lens(camera), mode, into_photograph=True)
+    return _cached_warp(camera.lens, mode, into_photograph=True)
 
 
 def photograph_to_pinhole(
@@ -189,31 +189,18 @@ def photograph_to_pinhole(
     check_shape("image", image, (camera.height, camera.width, None))
     if camera.is_pinhole:
         return image, torch.ones(image.shape[:2], dtype=torch.bool, device=image.device)
-    warp = _cached_warp(_lens(camera), "bilinear", into_photograph=False)
+    warp = _cached_warp(camera.lens, "bilinear", into_photograph=False)
     return warp.apply(image), warp.valid.to(image.device)
 
 
-_LENS = ("width", "height", "fx", "fy", "cx", "cy", "model", "distortion")
-_Lens = tuple[Any, ...]
-
-
-def _lens(camera: Camera) -> _Lens:
-    return tuple(getattr(camera, name) for name in _LENS)
-
-
-def _camera_of(lens: _Lens) -> Camera:
-    pose = torch.eye(4, dtype=torch.float64)
-    return Camera(**dict(zip(_LENS, lens, strict=True)), cam_from_world=pose)
-
-
 @lru_cache(maxsize=1024)
-def _cached_pinhole(lens: _Lens) -> Camera:
-    return _camera_of(lens).undistorted()
+def _cached_pinhole(lens: tuple[Any, ...]) -> Camera:
+    return Camera.of_lens(lens).undistorted()
 
 
 @lru_cache(maxsize=8)
-def _cached_warp(lens: _Lens, mode: WarpMode, *, into_photograph: bool) -> Warp:
-    camera = _camera_of(lens)
+def _cached_warp(lens: tuple[Any, ...], mode: WarpMode, *, into_photograph: bool) -> Warp:
+    camera = Camera.of_lens(lens)
     pinhole = _cached_pinhole(lens)
     if into_photograph:
         return Warp.between(camera, pinhole, mode)
