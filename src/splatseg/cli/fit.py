@@ -237,7 +237,7 @@ class ImportCommand(Printing):
     """
 
     file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
-    """The splat file: PLY, compressed PLY, .splat, SPZ, SOG or glTF."""
+    """The splat file: PLY, compressed PLY, .splat, .ksplat, SPZ, SOG or glTF."""
 
     output: NewSceneFolder
 

@@ -51,8 +51,8 @@ class Command(Printing):
     """
 
     scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
-    """Scene folder, in chunks or not, splat file (PLY, compressed PLY, .splat, SPZ, SOG, glTF), or
-    folder of a fit that is still running."""
+    """Scene folder, in chunks or not, splat file (PLY, compressed PLY, .splat, .ksplat, SPZ, SOG,
+    glTF), or folder of a fit that is still running."""
 
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="NEW")] = None
     """Scene folder to write, of a splat file or a level of chunks. It must not exist yet. None

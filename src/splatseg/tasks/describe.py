@@ -335,6 +335,7 @@ def _view_facts(views: Sequence[View]) -> dict[str, Any]:
     return {
         "photographs": sum(view.image is not None for view in views),
         "views": len(views),
+        "view_names": [view.name for view in views],
         "split": dict(sorted(Counter(view.split for view in views).items(), key=_split_order)),
         "sizes": list(sizes),
         "lenses": sorted({view.camera.model for view in views}),

@@ -118,7 +118,7 @@ class EditOptions:
     """Remove the part of the colour that depends on the direction of view."""
 
     cut: Literal["auto", "masks", "layer", "box", "off"] = "auto"
-    """Boundary at which Gaussians that cross it are split in two. masks: the label maps that the
+    """Boundary at which Gaussians that cross it are split. masks: the label maps that the
     layer was made from; layer: the boundary that the layer draws in training views; box: the box
     only; off: no splitting. auto: masks where the layer has them and the scene was not edited yet,
     else layer; always the box."""

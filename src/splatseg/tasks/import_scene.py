@@ -103,7 +103,7 @@ def import_scene(
     so that they cover what is visible.
 
     Args:
-        file: PLY, compressed PLY, .splat, SPZ, SOG or glTF.
+        file: PLY, compressed PLY, .splat, .ksplat, SPZ, SOG or glTF.
         folder: The scene folder to write. A scene that is there is replaced unless it has
             layers.
         options: The capture, or how cameras are placed.
