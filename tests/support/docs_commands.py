@@ -14,6 +14,7 @@ from typing import Any
 
 import httpx
 import pytest
+from filelock import FileLock
 
 from splatseg import cli
 from splatseg.io.scene import load_scene
@@ -128,8 +129,11 @@ class Reader:
                 shutil.copytree(kept, path)
         status = cli.main(words)
         for path, kept in made.items():
-            if status == 0 and not kept.exists():
-                shutil.copytree(path, kept)
+            with FileLock(f"{kept}.lock"):  # pages run at the same time: half of it is not there
+                if status == 0 and not kept.exists():
+                    unfinished = kept.with_suffix(".unfinished")
+                    shutil.copytree(path, unfinished)
+                    unfinished.rename(kept)
         errors = self._capsys.readouterr().err
         self._wrote |= dict.fromkeys(_results(words), tuple(words))
         for path, before in aside.items():

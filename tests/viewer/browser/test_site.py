@@ -7,14 +7,14 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser
 
+from support.once import made_once
+
 ROOT = Path(__file__).resolve().parents[3]
 PAGES = ("index", "tutorial", "gallery", "scale", "reference/lift", "decisions/fitting")
 
 
-@pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """As `make site` builds it, but for the notebooks, which tests of their own run."""
-    folder = tmp_path_factory.mktemp("site")
+def build(folder: Path) -> None:
+    """As `make site` does, but for the notebooks, which tests of their own run."""
     words = ["-q", "-W", "--keep-going", "-b", "html", "-c", "docs", "-D", "nb_execution_mode=off"]
     done = subprocess.run(
         [sys.executable, "-m", "sphinx", *words, "-d", folder / "trees", ".", folder / "html"],
@@ -25,7 +25,12 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    return folder / "html"
+
+
+@pytest.fixture(scope="session")
+def site(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Path:
+    """The folder of a web server."""
+    return made_once(tmp_path_factory, worker_id, "site", build) / "html"
 
 
 def test_every_page_is_there(site: Path) -> None:
