@@ -60,8 +60,8 @@ def test_tables_are_medians_with_their_spread(project: Path) -> None:
     assert "| `one` | 0.500 (0.250 to 0.750) |  |\n| two |  | 0.250 |\n" in text
     assert "| old |" not in text
     assert "\n\nbetween\n\n" in text
-    assert "| `two` | mIoU |  | 0.250 |  / 31 | abc 2026-11-28 |" in text
-    assert "Measured on: P, Python 3.11, torch 2.13." in text
+    assert "| `two` | mIoU |  | 0.250 |  / 31 | abc |" in text
+    assert "Measured on 2026-11-28: P, Python 3.11, torch 2.13." in text
     assert (project / "README.md").read_text() == "Without tables.\n"
 
 
