@@ -109,6 +109,7 @@ class Reader:
         monkeypatch.setattr(executors, "_check_answers", lambda address: None)
         # Virtual cameras are chosen from a third of the usual candidates.
         monkeypatch.setattr("splatseg.importing._virtual._POSITIONS", 8)
+        monkeypatch.setenv("OMP_NUM_THREADS", "1")  # on several, poses of photographs differ
         for name in ("DISPLAY", "WAYLAND_DISPLAY"):  # no browser is opened
             monkeypatch.delenv(name, raising=False)
 
@@ -227,7 +228,7 @@ def _edit_elsewhere(words: Sequence[str]) -> None:
 
     A file that is called edited, or the scene that was imported of it.
     """
-    if words[0] != "attach" or "--help" in words:
+    if words[0] != "attach" or "--help" in words or not Path(words[1]).exists():
         return
     source, target = Path(words[1]), Path(words[2])
     gaussians = read_splats(source) if source.is_file() else load_scene(source).gaussians
