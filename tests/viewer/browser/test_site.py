@@ -10,7 +10,15 @@ from playwright.sync_api import Browser
 from support.once import made_once
 
 ROOT = Path(__file__).resolve().parents[3]
-PAGES = ("index", "tutorial", "gallery", "gallery/saga", "scale", "reference/lift", "decisions/fitting")
+PAGES = (
+    "index",
+    "tutorial",
+    "gallery",
+    "gallery/saga",
+    "scale",
+    "reference/lift",
+    "decisions/fitting",
+)
 
 
 def build(folder: Path) -> None:
