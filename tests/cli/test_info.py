@@ -110,6 +110,8 @@ def test_details_come_a_line_each(capsys, generated_room) -> None:
     out = line(capsys, str(generated_room), "--verbose").splitlines()
     assert "  points: 4000" in out
     assert "  splats: none" in out
+    names = next(each for each in out if each.startswith("  view_names: ")).split(": ")[1]
+    assert sorted(names.split(", ")) == sorted(v.name for v in read_capture(generated_room).views)
 
 
 @pytest.mark.parametrize(
