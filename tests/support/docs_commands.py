@@ -9,12 +9,12 @@ import signal
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
-from filelock import FileLock
 
 from splatseg import cli
 from splatseg.io.scene import load_scene
@@ -22,6 +22,7 @@ from splatseg.io.splats import SplatWarning, read_splats, write_splats
 from splatseg.tasks import executors
 from splatseg.viewer._server import ViewServer
 from support.elsewhere import Elsewhere
+from support.once import make_whole
 
 _BLOCK = re.compile(r"^(```|~~~).*?$\n(.*?)^\1", re.MULTILINE | re.DOTALL)
 _LINE = re.compile(r"^ *(?:\$ )?(splatseg .*)$", re.MULTILINE)
@@ -130,11 +131,8 @@ class Reader:
                 shutil.copytree(kept, path)
         status = cli.main(words)
         for path, kept in made.items():
-            with FileLock(f"{kept}.lock"):  # pages run at the same time: half of it is not there
-                if status == 0 and not kept.exists():
-                    unfinished = kept.with_suffix(".unfinished")
-                    shutil.copytree(path, unfinished)
-                    unfinished.rename(kept)
+            if status == 0:
+                make_whole(kept, partial(shutil.copytree, path))
         errors = self._capsys.readouterr().err
         self._wrote |= dict.fromkeys(_results(words), tuple(words))
         for path, before in aside.items():

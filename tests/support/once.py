@@ -18,10 +18,15 @@ def made_once(
     base = tmp_path_factory.getbasetemp()
     folder = (base if worker_id == "master" else base.parent) / "generated" / name
     folder.parent.mkdir(exist_ok=True)
+    make_whole(folder, make)
+    return folder
+
+
+def make_whole(folder: Path, make: Callable[[Path], object]) -> None:
+    """Make a folder, unless it is there: by one process, and for all others whole or not at all."""
     with FileLock(f"{folder}.lock"):
         if not folder.is_dir():
-            unfinished = folder.with_name(f"{name}-unfinished")
+            unfinished = folder.with_name(f"{folder.name}-unfinished")
             shutil.rmtree(unfinished, ignore_errors=True)
             make(unfinished)
             unfinished.rename(folder)
-    return folder

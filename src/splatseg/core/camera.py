@@ -161,14 +161,18 @@ class Camera:
         self, pixels: Float[Tensor, "*batch 2"] | None = None
     ) -> tuple[Float[Tensor, "3"], Float[Tensor, "*batch 3"]]:
         """The centre and unit world directions of pixels; None is all centres, (H, W, 3)."""
-        if pixels is None:
-            plane = self._plane_of_all_pixels(self.lens)
-        else:
-            plane = self._plane_from_pixels(pixels)
+        plane = self.plane_of_pixels() if pixels is None else self._plane_from_pixels(pixels)
         directions = torch.cat((plane, torch.ones_like(plane[..., :1])), -1)
         directions = directions / torch.linalg.vector_norm(directions, dim=-1, keepdim=True)
         pose = self.world_from_cam.to(directions)
         return pose[:3, 3], directions @ pose[:3, :3].T
+
+    def plane_of_pixels(self) -> Float[Tensor, "height width 2"]:
+        """Where the ray of every pixel's centre meets the plane z = 1 of the camera, float64.
+
+        Kept for the last lenses, as a distortion is slow to invert: not to be changed.
+        """
+        return self._plane_of_pixels(self.lens)
 
     def pixel_centres(self) -> Float[Tensor, "height width 2"]:
         """Coordinates (u, v) of every pixel's centre, float64."""
@@ -267,8 +271,7 @@ class Camera:
 
     @staticmethod
     @lru_cache(maxsize=2)
-    def _plane_of_all_pixels(lens: tuple[Any, ...]) -> Tensor:
-        """Where the rays of all pixels meet z = 1. Kept, as a distortion is slow to invert."""
+    def _plane_of_pixels(lens: tuple[Any, ...]) -> Tensor:
         camera = Camera.of_lens(lens)
         return camera._plane_from_pixels(camera.pixel_centres())
 

@@ -209,10 +209,9 @@ def _cached_warp(lens: tuple[Any, ...], mode: WarpMode, *, into_photograph: bool
 
 def _meeting_points(target: Camera, source: Camera) -> tuple[Tensor, Tensor]:
     """Where the target's rays meet the source image, and whether they do."""
-    straight = target.undistort_pixels(target.pixel_centres())
-    scale = straight.new_tensor([source.fx / target.fx, source.fy / target.fy])
-    straight = (straight - straight.new_tensor([target.cx, target.cy])) * scale
-    straight = straight + straight.new_tensor([source.cx, source.cy])
+    plane = target.plane_of_pixels()
+    straight = plane * plane.new_tensor([source.fx, source.fy])
+    straight = straight + plane.new_tensor([source.cx, source.cy])
     at = source.distort_pixels(straight)
     size = at.new_tensor([source.width, source.height])
     valid = ((at >= 0) & (at <= size)).all(dim=-1)

@@ -417,13 +417,7 @@ def on_border(ids: Int[Tensor, "height width"]) -> Tensor:
 
 def plane_of_pixels(camera: Camera) -> Float[Tensor, "height width 3"]:
     """1, x and y of every pixel's centre on the plane z = 1 of the camera."""
-    _, rays = camera.rays()
-    rotation = camera.cam_from_world.double()[:3, :3]
-    rays = rays.double() @ rotation.T
-    z = rays[..., 2:]
-    # A fisheye's pixel may look sideways, where there is no point on the plane.
-    flat = torch.where(z > 1e-3, rays[..., :2] / z.clamp_min(1e-3), 0.0)
-    return torch.cat((torch.ones_like(z), flat), dim=-1).float()
+    return torch.nn.functional.pad(camera.plane_of_pixels(), (1, 0), value=1.0).float()
 
 
 def view_direction(
